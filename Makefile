@@ -1,0 +1,17 @@
+.PHONY: format lint type test check
+
+format:
+	ruff check --select I --fix .
+	ruff format .
+
+lint:
+	ruff check .
+	ruff format --check .
+
+type:
+	mypy
+
+test:
+	python -m pytest
+
+check: format lint type test

@@ -1,0 +1,115 @@
+"""
+Baselines: what is subtracted from the return before it weighs a score. One pure function each.
+
+A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. It keeps the gradient unbiased as long as
+b_t does not depend on the action at t or on what the action has led to (Williams, 1992, theorem 1). A user's own
+function is a baseline too. This module looks up to ``rollouts``, whose ``Rollout`` is what a baseline is given.
+"""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import torch as th
+
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, split_parameters
+from sb3_reinforce.rollouts import Rollout, select
+
+Baseline: TypeAlias = Callable[[Rollout], th.Tensor]
+
+
+def none(rollout: Rollout) -> th.Tensor:
+    """``b_t = 0``. Unbiased."""
+    return th.zeros_like(rollout.returns)
+
+
+def mean(rollout: Rollout) -> th.Tensor:
+    """
+    ``b_t = mean of G over all used steps of the rollout``.
+
+    Biased: the mean contains the return that it is subtracted from, and early and late returns are pooled. Of the
+    score of step t, the share that stays is 1 − (the weight of the step's own episode in the mean).
+    """
+    return th.full_like(rollout.returns, float(rollout.returns[rollout.used].mean()))
+
+
+def time_mean(rollout: Rollout) -> th.Tensor:
+    """
+    ``b_t = mean of G_t over the episodes that reach step t``.
+
+    With N episodes of one length the expected gradient is exactly (N − 1)/N of the true one: each return is in its own
+    mean with weight 1/N. A step that a single episode reaches has weight G_t − b_t = 0.
+    """
+    totals, counts = _by_timestep(rollout)
+    return totals / counts.clamp(min=1)
+
+
+def leave_one_out(rollout: Rollout) -> th.Tensor:
+    """
+    ``b_t = mean of G_t over the other episodes that reach step t``, and 0 where there is none.
+
+    Unbiased: the other episodes know nothing of this one's action (Kool et al., 2019, "Buy 4 REINFORCE samples").
+    """
+    totals, counts = _by_timestep(rollout)
+    return (totals - rollout.returns) * rollout.used / (counts - 1).clamp(min=1)
+
+
+def value(rollout: Rollout) -> th.Tensor:
+    """
+    ``b_t = V(s_t)``, by the critic as it was before this rollout trained it. Unbiased with ``gae_lambda=1`` where no
+    episode is cut.
+    """
+    assert rollout.values is not None
+    return rollout.values
+
+
+def optimal(rollout: Rollout) -> th.Tensor:
+    """
+    ``b_i = Σ_{j≠i} ⟨A_j, S_j⟩ / Σ_{j≠i} ‖S_j‖²`` for all steps of episode i, and 0 where the other scores vanish.
+
+    ``S_j = Σ_t γ^t ∇log π(a_t|s_t)`` is the score of episode j and ``A_j = Σ_t γ^t ∇log π(a_t|s_t) G_t``, without γ^t
+    unless ``discount_scores``. A constant b leaves the trace of the covariance of A − b S as
+    E‖A‖² − 2b E⟨A, S⟩ + b² E‖S‖² + const, since E[S] = 0; this b minimises it. For the total return it is the mean of
+    G_0 weighted by ‖S_j‖² (Peters and Schaal, 2008, section 3.2, summed over components). Unbiased, because the sums
+    leave out the episode that b is applied to.
+    """
+    products, squares = _score_products(rollout)
+    others = 1 - th.eye(len(products), dtype=products.dtype)
+    above, below = others @ products, others @ squares
+    return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)[rollout.episodes]
+
+
+def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+    """The sum of G_t over the used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
+    _, group = th.unique(rollout.timesteps, return_inverse=True)
+    totals, counts = (
+        th.zeros(int(group.max()) + 1, dtype=x.dtype).index_add_(0, group.flatten(), x.flatten())
+        for x in (rollout.returns * rollout.used, rollout.used.to(rollout.returns.dtype))
+    )
+    return totals[group], counts[group]
+
+
+def _score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+    """⟨A_j, S_j⟩ and ‖S_j‖² of each episode j, shape ``(n_episodes,)``, by two backward passes an episode."""
+    parameters, episodes = split_parameters(rollout.policy)[0], rollout.episodes
+    products = th.zeros(2, int(episodes.max()) + 1, dtype=rollout.returns.dtype)
+    for episode in th.unique(episodes[rollout.used]):
+        steps = rollout.used & (episodes == episode)
+        actions = as_policy_actions(select(rollout.actions, steps), rollout.policy.action_space)
+        log_prob, _ = log_prob_and_entropy(rollout.policy, select(rollout.observations, steps), actions)
+        weights = rollout.discounts[steps] * th.stack([rollout.returns[steps], th.ones_like(rollout.returns[steps])])
+        weighted, score = (
+            th.cat([grad.flatten() for grad in th.autograd.grad(log_prob, parameters, weight, retain_graph=True)])
+            for weight in weights.to(log_prob)
+        )
+        products[:, episode] = th.stack([weighted @ score, score @ score]).to(products)
+    return products[0], products[1]
+
+
+BASELINES: dict[str, Baseline] = {
+    "none": none,
+    "mean": mean,
+    "time_mean": time_mean,
+    "leave_one_out": leave_one_out,
+    "value": value,
+    "optimal": optimal,
+}

@@ -1,0 +1,202 @@
+"""
+How a rollout is collected: a number of steps per environment, or a quota of whole episodes per environment.
+
+It stands apart from ``rollouts``, which holds what was collected and the pure functions on it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce.arguments import check_finite
+from sb3_reinforce.policies import act
+from sb3_reinforce.returns import Bools
+from sb3_reinforce.rollouts import Extent
+
+# The arrays of a RolloutBuffer that have one row per step
+ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
+
+
+@dataclass(frozen=True)
+class Ends:
+    """
+    How the episodes of a rollout end.
+
+    :param dones: Whether a step is the last of its episode, shape ``(n_steps, n_envs)``
+    :param terminal_obs: The terminal observation at each (step, environment) where a time limit ended the episode
+    """
+
+    dones: Bools
+    terminal_obs: dict[tuple[int, int], Any]
+
+
+def collect(
+    model: OnPolicyAlgorithm,
+    env: VecEnv,
+    callback: BaseCallback,
+    buffer: RolloutBuffer,
+    extent: Extent,
+) -> Ends | None:
+    """
+    Step the environments and write what happens into a rollout buffer, with one actor pass a step.
+
+    :param model: The algorithm; its ``_last_obs`` and ``num_timesteps`` are kept up to date
+    :param env: The environments
+    :param callback: Called at each step, with the locals that the callbacks of Stable-Baselines3 read
+    :param buffer: The rollout buffer; it grows where it is too small and keeps one row per step
+    :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
+    :return: How the episodes ended; None if the callback stopped the collection
+    :raises ValueError: If an episode that is waited for does not end
+    """
+    policy, step = model.policy, 0
+    all_dones: list[Bools] = []
+    terminal_obs: dict[tuple[int, int], Any] = {}
+    owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
+    deadline = extent.max_episode_steps
+    while step < extent.n_steps and owed.any():
+        if step == deadline:
+            raise ValueError(
+                f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole episodes "
+                "are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
+            )
+        if step == buffer.buffer_size:
+            resize(buffer, 2 * step)
+        if model.use_sde and model.sde_sample_freq > 0 and step % model.sde_sample_freq == 0:
+            policy.reset_noise(env.num_envs)
+        sampled, values, log_prob = sample(policy, model._last_obs, step)
+        actions = sampled.cpu().numpy().reshape(env.num_envs, *model.action_space.shape)  # type: ignore[misc]
+        write(buffer.observations, step, model._last_obs)
+        write(buffer.actions, step, actions)
+        write(buffer.episode_starts, step, model._last_episode_starts)
+        if values is not None and log_prob is not None:
+            write(buffer.values, step, values.cpu())
+            write(buffer.log_probs, step, log_prob.cpu())
+
+        clipped_actions = as_env_actions(policy, actions)
+        new_obs, rewards, dones, infos = env.step(clipped_actions)
+        write(buffer.rewards, step, rewards)
+        all_dones.append(dones)
+        model.num_timesteps += env.num_envs
+        model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+
+        callback.update_locals(locals())
+        if not callback.on_step():
+            return None
+        if dones.any():
+            wanted = np.flatnonzero(dones & (owed > 0))
+            model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
+            for i in wanted:
+                if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
+                    terminal_obs[step, int(i)] = infos[i]["terminal_observation"]
+            owed[wanted] -= 1
+            begun[wanted] = step + 1
+            deadline = extent.max_episode_steps + min(begun[owed > 0], default=0)
+        step += 1
+    resize(buffer, step)
+    buffer.pos, buffer.full = step, True
+    return Ends(np.stack(all_dones), terminal_obs)
+
+
+@th.no_grad()
+def sample(policy: ActorCriticPolicy, obs: Any, step: int) -> tuple[th.Tensor, th.Tensor | None, th.Tensor | None]:
+    """
+    ``act`` on the environments' observations, naming them where the policy refuses them because they are not finite.
+
+    :param policy: The policy
+    :param obs: Observations of the environments
+    :param step: The step of the rollout, for the message
+    :return: As ``act``
+    :raises ValueError: If an observation is not finite
+    """
+    try:
+        return act(policy, obs_as_tensor(obs, policy.device))
+    except ValueError:
+        check_finite("The observation", obs, (step,))
+        raise
+
+
+def as_env_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
+    """
+    The policy's actions as the environment takes them: clipped or unscaled to a Box, shifted to a discrete start.
+
+    :param policy: The policy
+    :param actions: Shape ``(n_envs, *action_space.shape)``
+    :return: The same shape
+    """
+    space = policy.action_space
+    if isinstance(space, spaces.Box):
+        return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
+    return shift_to_start(space, actions)
+
+
+def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
+    """
+    Actions counted from 0, as policies count, to actions of the space.
+
+    :param space: An action space; Discrete and MultiDiscrete may have a start
+    :param actions: Shape ``(..., *space.shape)``
+    :return: The same shape
+    """
+    start = getattr(space, "start", 0)
+    return actions + start if np.any(start) else actions
+
+
+def write(rows: Any, step: int, values: Any) -> None:
+    """
+    Write one step into the rows of a rollout buffer.
+
+    :param rows: An array of shape ``(n_steps, n_envs, ...)``, or a dict of them
+    :param step: The row
+    :param values: As many elements as a row has, or a dict
+    """
+    if isinstance(rows, dict):
+        for key, part in rows.items():
+            write(part, step, values[key])
+    else:
+        rows[step] = values.reshape(rows.shape[1:])
+
+
+def resize(buffer: RolloutBuffer, n_steps: int) -> None:
+    """
+    Give a rollout buffer another number of rows, keeping the rows that it has.
+
+    :param buffer: The rollout buffer
+    :param n_steps: Its new number of rows
+    """
+
+    def resized(rows: Any) -> Any:
+        if isinstance(rows, dict):
+            return {key: resized(part) for key, part in rows.items()}
+        if n_steps <= len(rows):
+            return rows[:n_steps]
+        return np.concatenate([rows, np.zeros((n_steps - len(rows), *rows.shape[1:]), dtype=rows.dtype)])
+
+    if n_steps != buffer.buffer_size:
+        for name in ROWS:
+            setattr(buffer, name, resized(getattr(buffer, name)))
+        buffer.buffer_size = n_steps
+
+
+def check_data(buffer: RolloutBuffer, last_obs: Any, ends: Ends) -> None:
+    """
+    Check what the environments returned.
+
+    :param buffer: The rollout buffer
+    :param last_obs: The observations after the last step
+    :param ends: How the episodes ended
+    :raises ValueError: Naming what is not finite, and the step and environment
+    """
+    check_finite("The reward", buffer.rewards)
+    check_finite("The observation", buffer.observations)
+    check_finite("The observation", last_obs, (buffer.buffer_size,))
+    for where, obs in ends.terminal_obs.items():
+        check_finite("The terminal observation", obs, where)

@@ -1,0 +1,104 @@
+"""The critic: its values along a rollout, and its regression on the returns by an optimizer of its own."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import obs_as_tensor
+from torch.nn import functional as F
+
+from sb3_reinforce import optimization
+from sb3_reinforce.collection import Ends
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, overrides
+from sb3_reinforce.returns import Floats
+from sb3_reinforce.rollouts import flatten, take
+
+
+@th.no_grad()
+def evaluate(policy: ActorCriticPolicy, buffer: RolloutBuffer, has_critic: bool) -> None:
+    """
+    Write V(s_t) and log π(a_t|s_t) into a rollout buffer, each in one batch: the parameters do not change during a
+    rollout. A policy that overrides ``forward`` has computed them at each step already.
+
+    :param policy: The policy
+    :param buffer: The rollout buffer
+    :param has_critic: Whether V is wanted
+    """
+    if overrides(policy, "forward"):
+        return
+    obs = flatten(obs_as_tensor(buffer.observations, policy.device))
+    actions = as_policy_actions(th.as_tensor(buffer.actions, device=policy.device).flatten(0, 1), policy.action_space)
+    log_prob, _ = log_prob_and_entropy(policy, obs, actions)
+    buffer.log_probs = log_prob.reshape(buffer.rewards.shape).cpu().numpy()
+    if has_critic:
+        buffer.values = policy.predict_values(obs).reshape(buffer.rewards.shape).cpu().numpy()
+
+
+@th.no_grad()
+def values_after(policy: ActorCriticPolicy, values: Floats, last_obs: Any, ends: Ends) -> Floats:
+    """
+    V of the state that follows each step: 0 after a terminal one, V(terminal observation) at a time limit.
+
+    :param policy: The policy
+    :param values: V(s_t), shape ``(n_steps, n_envs)``
+    :param last_obs: The observations after the last step
+    :param ends: How the episodes ended
+    :return: Shape ``(n_steps, n_envs)``
+    """
+
+    def predict(obs: Any) -> Floats:
+        return policy.predict_values(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
+
+    following = np.where(ends.dones, 0.0, np.vstack([values[1:], predict(last_obs)]))
+    if ends.terminal_obs:
+        steps, envs = zip(*ends.terminal_obs, strict=True)
+        following[steps, envs] = predict(stack(list(ends.terminal_obs.values())))
+    return following
+
+
+def stack(observations: list[Any]) -> Any:
+    """
+    Make a batch of single observations.
+
+    :param observations: ``n`` observations, arrays or dicts of arrays
+    :return: Shape ``(n, ...)``, or a dict of such arrays
+    """
+    if isinstance(observations[0], dict):
+        return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+def fit_critic(
+    policy: ActorCriticPolicy,
+    optimizer: th.optim.Optimizer,
+    obs: PyTorchObs,
+    returns: th.Tensor,
+    n_updates: int,
+    batch_size: int,
+    max_grad_norm: float | None,
+) -> float:
+    """
+    Lower the mean of ``(G_t − V(s_t))²`` over the rollout, in minibatches drawn without replacement.
+
+    :param policy: The policy; only the parameters that ``optimizer`` holds are changed
+    :param optimizer: The critic's optimizer
+    :param obs: ``n`` observations
+    :param returns: G_t, shape ``(n,)``
+    :param n_updates: Passes over the rollout
+    :param batch_size: Size of a minibatch; the last one of a pass may be smaller
+    :param max_grad_norm: Bound on the norm of a step's gradient, None for no bound
+    :return: The mean of the minibatches' losses
+    :raises ValueError: If a gradient is not finite; the critic keeps the parameters of the step before
+    """
+    parameters = optimizer.param_groups[0]["params"]
+    losses = []
+    for _ in range(n_updates):
+        for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]
+            loss = F.mse_loss(policy.predict_values(take(obs, batch)).flatten(), returns[batch])
+            gradients = th.autograd.grad(loss, parameters)
+            optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
+            losses.append(loss.detach())
+    return float(th.stack(losses).mean())

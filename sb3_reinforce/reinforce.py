@@ -1,0 +1,397 @@
+"""REINFORCE as an algorithm of Stable-Baselines3."""
+
+from typing import Any, ClassVar, TypeVar, cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.utils import explained_variance, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
+
+from sb3_reinforce import optimization
+from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce.baselines import BASELINES, Baseline
+from sb3_reinforce.collection import check_data, collect, shift_to_start
+from sb3_reinforce.critic import fit_critic
+from sb3_reinforce.policies import (
+    as_policy_actions,
+    divide_logits,
+    floor_std,
+    log_prob_and_entropy,
+    split_parameters,
+)
+from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, select
+from sb3_reinforce.settings import check_reinforce
+from sb3_reinforce.weighing import Running, Weighing, normalized, weigh
+
+SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
+
+
+class REINFORCE(OnPolicyAlgorithm):
+    """
+    REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
+
+    One optimizer step per rollout, along
+
+        ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
+
+    (Williams, 1992, equation 4 and theorem 1; γ^t only with ``discount_scores``). m_t is 1 where the return of the step
+    is known, else 0. The denominator is ``n_steps * n_envs`` for fixed rollouts; for whole episodes see
+    ``normalize_by``. With ``baseline="none"`` or ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``,
+    ``discount_scores=True`` and no normalization or clipping, E[ĝ] is exactly ∇θ E[G_0].
+
+    What an unfinished episode is worth: with ``baseline="value"`` the critic's V is added at a time limit and where
+    ``n_steps`` cuts an episode. Without a critic a time limit counts as the end of the episode, and an episode that
+    ``n_steps`` cuts is left out: its return is not known. The value network is then never evaluated, except by a policy
+    that overrides ``forward`` or ``evaluate_actions``, and never used.
+
+    The critic has an optimizer of its own, of the policy's ``optimizer_class``, for the parameters that only V depends
+    on. A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's
+    passes, which would move the policy a second time, but by the one policy step, to whose loss the critic's squared
+    error is then added with weight ``vf_coef``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, or a class)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str)
+    :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
+    :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
+        32 steps for ``baseline="value"``, 16 episodes for the others
+    :param gamma: Discount factor
+    :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
+        ``baseline="value"`` and ``reward_to_go=True``
+    :param ent_coef: Weight of the entropy in the objective, it can be a schedule
+    :param vf_coef: Weight of the critic's squared error in the policy step, where a features extractor is shared
+    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None for no bound
+    :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
+        function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
+    :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Every environment starts anew and contributes
+        a number of episodes fixed beforehand; steps beyond them are made, counted and not used
+    :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
+        discounted from the start of the episode and never takes the factor γ^t
+    :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
+    :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of steps used (biased: a ratio of
+        two random numbers), or ``"episodes"``, their number (unbiased)
+    :param n_critic_updates: Passes of the critic over each rollout
+    :param batch_size: Minibatch size of the critic's passes
+    :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule
+    :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
+        after each step; 0 for no floor
+    :param max_episode_steps: With ``n_episodes``, the length beyond which an episode counts as one that never ends
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE) instead of action noise
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only before each rollout
+    :param rollout_buffer_class: Rollout buffer class to use. Its arrays are written in place: ``add`` and
+        ``compute_returns_and_advantage`` are not called
+    :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
+    :param normalize_advantage: Scale G_t − b_t to mean 0 and standard deviation 1 per rollout; skipped below two
+        samples and where the deviation is 0
+    :param stats_window_size: Window size for the rollout logging, in episodes
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises TypeError: If an argument is of the wrong kind
+    :raises ValueError: If an argument is out of its range, or does not go with another; the message names it
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 2e-3,
+        n_steps: int | None = None,
+        gamma: float = 0.99,
+        gae_lambda: float = 1.0,
+        ent_coef: float | Schedule = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float | None = None,
+        baseline: str | Baseline = "value",
+        n_episodes: int | None = None,
+        reward_to_go: bool = True,
+        discount_scores: bool = False,
+        normalize_by: str = "steps",
+        n_critic_updates: int = 4,
+        batch_size: int = 128,
+        critic_learning_rate: float | Schedule | None = None,
+        temperature: float | Schedule = 1.0,
+        min_std: float = 0.0,
+        max_episode_steps: int = 100_000,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        normalize_advantage: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            check_spaces(env.observation_space, env.action_space)
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,  # type: ignore[arg-type]
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,  # type: ignore[arg-type]
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=None if policy_kwargs is None else dict(policy_kwargs),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.baseline = baseline
+        self.n_episodes = n_episodes
+        self.reward_to_go = reward_to_go
+        self.discount_scores = discount_scores
+        self.normalize_by = normalize_by
+        self.n_critic_updates = n_critic_updates
+        self.batch_size = batch_size
+        self.critic_learning_rate = critic_learning_rate
+        self.temperature = temperature
+        self.min_std = min_std
+        self.max_episode_steps = max_episode_steps
+        self.normalize_advantage = normalize_advantage
+        self._rollout: Rollout | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether a critic is trained and used."""
+        return self._weighing.has_critic
+
+    @property
+    def _weighing(self) -> Weighing:
+        baseline = check_function("baseline", self.baseline, BASELINES)
+        return Weighing(baseline, self.gamma, self.gae_lambda, self.reward_to_go, self.discount_scores)
+
+    def _setup_lr_schedule(self) -> None:
+        critic_rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
+        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate)
+        self.critic_lr_schedule = CheckedSchedule("critic_learning_rate", critic_rate)
+        self.ent_coef_schedule = CheckedSchedule("ent_coef", self.ent_coef)
+        self.temperature_schedule = CheckedSchedule("temperature", self.temperature, above=True)
+
+    def _setup_model(self) -> None:
+        check_reinforce(self)
+        # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout sizes it anew
+        n_steps, self.n_steps = self.n_steps, self.n_steps or 1
+        super()._setup_model()
+        self.n_steps = n_steps
+
+        self._actor_parameters, critic_parameters, self._shared_parameters = split_parameters(self.policy)
+        self.critic_optimizer = self.policy.optimizer_class(
+            critic_parameters,
+            lr=self.critic_lr_schedule(1),  # type: ignore[call-arg]
+            **self.policy.optimizer_kwargs,
+        )
+        self._temperature = th.ones((), device=self.device)
+        self._update_temperature()
+        if self.temperature != 1:
+            divide_logits(self.policy, self._temperature)
+        floor_std(self.policy, self.min_std)
+
+    def _update_temperature(self) -> None:
+        self._temperature.fill_(self.temperature_schedule(self._current_progress_remaining))
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # A last rollout that overshoots total_timesteps must not train at a negative rate
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
+    ) -> bool:
+        """
+        Collect a rollout with the current policy and weigh its steps.
+
+        :param env: The training environment
+        :param callback: Called at each step, and at the beginning and end of the rollout
+        :param rollout_buffer: Filled as by A2C: ``advantages`` is G_t − b_t, and ``returns`` what the critic is fitted
+            to, or without a critic G_t; both are 0 at steps that are not used
+        :param n_rollout_steps: Steps per environment, None for whole episodes
+        :return: False if the callback stopped the collection; the rollout is then dropped
+        :raises ValueError: If a reward, an observation or a baseline is not finite, if no episode ended in a rollout
+            that needs one, or if an episode does not end. The parameters have not been touched, and the environments
+            are reset before they are used again
+        """
+        self.policy.set_training_mode(False)
+        self._update_temperature()
+        rollout_buffer.reset()
+        if n_rollout_steps is None and not np.all(self._last_episode_starts):
+            self._last_obs = env.reset()  # type: ignore[assignment]
+            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        if np.all(self._last_episode_starts):
+            self._running = Running.none(env.num_envs)
+        if self.use_sde:
+            self.policy.reset_noise(env.num_envs)
+        callback.on_rollout_start()
+        if n_rollout_steps is None:
+            extent = Extent.whole_episodes(cast(int, self.n_episodes), env.num_envs, self.max_episode_steps)
+        else:
+            extent = Extent.fixed(n_rollout_steps, env.num_envs)
+        self._rollout = None
+        try:
+            ends = collect(self, env, callback, rollout_buffer, extent)
+            if ends is None:
+                return False
+            check_data(rollout_buffer, self._last_obs, ends)
+            self._rollout = weigh(
+                self.policy, rollout_buffer, ends, self._last_obs, extent, self._running, self._weighing
+            )
+        finally:
+            if self._rollout is None:
+                # A rollout that is broken off is dropped, and the environments are reset before they are used again
+                self._last_obs = None
+        self._running = self._running.after(rollout_buffer.rewards, ends.dones, self.gamma)
+        self.logger.record("rollout/complete_fraction", float(in_finished_episode(ends.dones).mean()))
+        if n_rollout_steps is None:
+            self.logger.record("rollout/used_fraction", float(self._rollout.used.double().mean()))
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def train(self) -> None:
+        """
+        One policy step along ĝ, then the critic's passes.
+
+        :raises ValueError: If a gradient is not finite; the parameters are those before that step
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        rollout = cast(Rollout, self._rollout)
+        used = rollout.used
+        obs = select(rollout.observations, used)
+        actions = as_policy_actions(select(rollout.actions, used), self.action_space)
+        targets = select(th.as_tensor(self.rollout_buffer.returns, device=self.device), used)
+        weights = select(th.as_tensor(self.rollout_buffer.advantages, device=self.device), used)
+        if self.normalize_advantage:
+            weights = normalized(weights)
+        weights = weights * select(rollout.discounts, used).to(weights)
+
+        log_prob, entropy = log_prob_and_entropy(self.policy, obs, actions)
+        policy_loss = -(weights * log_prob).sum() / self._denominator(rollout)
+        entropy_loss = -entropy.sum() / self._denominator(rollout)
+        loss = policy_loss + self.ent_coef_schedule(self._current_progress_remaining) * entropy_loss
+        if self.has_critic and self._shared_parameters:
+            loss = loss + self.vf_coef * F.mse_loss(self.policy.predict_values(obs).flatten(), targets)
+        gradient = th.autograd.grad(loss, self._actor_parameters, allow_unused=True)
+        grad_norm = optimization.step(
+            self.policy.optimizer, self._actor_parameters, gradient, self.max_grad_norm, "policy"
+        )
+        floor_std(self.policy, self.min_std)
+        self._n_updates += 1
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/entropy_loss", -entropy.mean().item())
+        self.logger.record("train/policy_loss", policy_loss.item())
+        self.logger.record("train/grad_norm", grad_norm)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        if self.has_critic:
+            self._train_critic(obs, targets, select(cast(th.Tensor, rollout.values), used))
+
+    def _train_critic(self, obs: PyTorchObs, targets: th.Tensor, values: th.Tensor) -> None:
+        """Fit V(s_t) to the returns, and log how much of their variance it explained before."""
+        update_learning_rate(self.critic_optimizer, self.critic_lr_schedule(self._current_progress_remaining))
+        value_loss = fit_critic(
+            self.policy, self.critic_optimizer, obs, targets, self.n_critic_updates, self.batch_size, self.max_grad_norm
+        )
+        self.logger.record("train/value_loss", value_loss)
+        self.logger.record("train/explained_variance", explained_variance(values.numpy(), targets.cpu().numpy()))
+
+    def _denominator(self, rollout: Rollout) -> int:
+        """The constant ``n_steps * n_envs`` for fixed rollouts, else by ``normalize_by``."""
+        if self.n_steps is not None:
+            return rollout.used.numel()
+        return int(rollout.used.sum()) if self.normalize_by == "steps" else cast(int, self.n_episodes)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
+
+        :param observation: The input observation
+        :param state: Passed on; the policies are not recurrent
+        :param episode_start: Passed on
+        :param deterministic: Whether to return the most likely action instead of a sample
+        :return: The action and ``state``
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return shift_to_start(self.action_space, actions), state
+
+    def learn(
+        self: SelfREINFORCE,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 10,
+        tb_log_name: str = "REINFORCE",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfREINFORCE:
+        """
+        Train until at least ``total_timesteps`` environment steps are made.
+
+        :param total_timesteps: Environment steps, of all environments together; the last rollout is finished
+        :param callback: Called at each step of the environments
+        :param log_interval: Rollouts between two entries of the log; None for no log
+        :param tb_log_name: The name of the run for tensorboard
+        :param reset_num_timesteps: Whether to begin the count of steps, and the episodes, anew
+        :param progress_bar: Display a progress bar using tqdm and rich
+        :return: The trained model
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
+        """
+        check_number("total_timesteps", total_timesteps, 0)
+        if log_interval is not None:
+            check_integer("log_interval", log_interval, 1)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+        # The first rollout is drawn at the temperature of the run's start, not at that of the end of the run before
+        self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
+        return total_timesteps, callback
+
+    def _excluded_save_params(self) -> list[str]:
+        mine = ["_actor_parameters", "_shared_parameters", "_rollout", "_temperature"]
+        return [*super()._excluded_save_params(), *mine]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer", "critic_optimizer"], []
