@@ -26,8 +26,8 @@ def mean(rollout: Rollout) -> th.Tensor:
     """
     ``b_t = mean of G over all used steps of the rollout``.
 
-    Biased: the mean contains the return that it is subtracted from, and early and late returns are pooled. Of the
-    score of step t, the share that stays is 1 − (the weight of the step's own episode in the mean).
+    Biased: the mean contains the returns that it is subtracted from. For N episodes of one length and without γ^t the
+    expected gradient lacks ``∇E[mean_t G_t] / N``.
     """
     return th.full_like(rollout.returns, float(rollout.returns[rollout.used].mean()))
 
@@ -72,7 +72,7 @@ def optimal(rollout: Rollout) -> th.Tensor:
     G_0 weighted by ‖S_j‖² (Peters and Schaal, 2008, section 3.2, summed over components). Unbiased, because the sums
     leave out the episode that b is applied to.
     """
-    products, squares = _score_products(rollout)
+    products, squares = score_products(rollout)
     others = 1 - th.eye(len(products), dtype=products.dtype)
     above, below = others @ products, others @ squares
     return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)[rollout.episodes]
@@ -88,8 +88,13 @@ def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     return totals[group], counts[group]
 
 
-def _score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
-    """⟨A_j, S_j⟩ and ‖S_j‖² of each episode j, shape ``(n_episodes,)``, by two backward passes an episode."""
+def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+    """
+    ⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, by two backward passes an episode.
+
+    :param rollout: The rollout
+    :return: Two tensors of shape ``(n_episodes,)``; 0 for an episode without used steps
+    """
     parameters, episodes = split_parameters(rollout.policy)[0], rollout.episodes
     products = th.zeros(2, int(episodes.max()) + 1, dtype=rollout.returns.dtype)
     for episode in th.unique(episodes[rollout.used]):

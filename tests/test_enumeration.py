@@ -1,0 +1,231 @@
+"""
+The expected gradient by exact enumeration: the sum over all batches of N episodes of their probability times ĝ.
+
+The policy is a softmax over a table, in float64; the batch goes through the package's own returns, baselines and
+denominators. ∇E[G_0] comes from autograd through the probabilities of the trajectories.
+"""
+
+from functools import partial
+from itertools import product
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Tree
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.baselines import score_products
+from sb3_reinforce.collection import Ends
+from sb3_reinforce.rollouts import Extent
+from sb3_reinforce.weighing import Running, weigh
+
+GAMMA = 0.5
+LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
+
+
+class DoubleExtractor(FlattenExtractor):
+    """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
+
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+def make_model(ragged=False, **kwargs):
+    arguments = {"gamma": GAMMA, "n_episodes": 2, "normalize_by": "episodes", "discount_scores": True, **kwargs}
+    policy_kwargs = {"net_arch": [], "features_extractor_class": DoubleExtractor}
+    th.set_default_dtype(th.float64)
+    model = REINFORCE("MlpPolicy", Tree(ragged), policy_kwargs=policy_kwargs, device="cpu", **arguments)
+    th.set_default_dtype(th.float32)
+    with th.no_grad():
+        model.policy.action_net.weight.copy_(LOGITS.T)
+        model.policy.action_net.bias.zero_()
+    model.policy.action_net.bias.requires_grad_(False)
+    return model
+
+
+def log_pi(logits, node, action):
+    return logits[node].log_softmax(0)[action]
+
+
+def score(node, action):
+    logits = LOGITS.clone().requires_grad_()
+    return th.autograd.grad(log_pi(logits, node, action), logits)[0]
+
+
+def true_gradient(trajectories, utility):
+    """∇ Σ p(τ) utility(τ)."""
+    logits = LOGITS.clone().requires_grad_()
+    expected = sum(
+        th.stack([log_pi(logits, node, action) for node, action, _ in trajectory]).sum().exp() * utility(trajectory)
+        for trajectory in trajectories
+    )
+    return th.autograd.grad(expected, logits)[0]
+
+
+def discounted_return(trajectory, begin=0):
+    return sum(GAMMA**k * reward for k, (_, _, reward) in enumerate(trajectory[begin:]))
+
+
+def fill(model, batch):
+    """
+    A rollout buffer that holds one episode per environment.
+
+    An environment that has ended its episode has gone on; what it did then has absurd rewards and must not be used.
+    """
+    n_steps, n_envs = max(map(len, batch)), len(batch)
+    buffer = RolloutBuffer(n_steps, model.observation_space, model.action_space, "cpu", n_envs=n_envs)
+    buffer.rewards += 1e6
+    dones = np.zeros((n_steps, n_envs), dtype=bool)
+    for i, trajectory in enumerate(batch):
+        for t, (node, action, reward) in enumerate(trajectory):
+            buffer.observations[t, i], buffer.actions[t, i], buffer.rewards[t, i] = Tree.observe(node), action, reward
+        dones[len(trajectory) - 1, i] = True
+    return buffer, Ends(dones, {})
+
+
+def estimate(model, batch):
+    """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
+    buffer, ends = fill(model, batch)
+    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
+    rollout = weigh(model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing)
+    weights = rollout.discounts * (rollout.returns - model._weighing.baseline(rollout)) * rollout.used
+    terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
+    return sum(terms) / model._denominator(rollout), int(rollout.used.sum())
+
+
+def expectation(model, trajectories, n_episodes, statistic):
+    """Σ over all batches of p(batch) · statistic(ĝ, number of steps)."""
+    total = 0.0
+    for batch in product(trajectories, repeat=n_episodes):
+        log_p = th.stack([log_pi(LOGITS, node, action) for episode in batch for node, action, _ in episode]).sum()
+        total = total + log_p.exp() * statistic(*estimate(model, batch))
+    return total
+
+
+def expected_gradient(model, n_episodes=2):
+    return expectation(model, model.env.envs[0].unwrapped.trajectories(), n_episodes, lambda gradient, steps: gradient)
+
+
+def gradient_of_return(model):
+    return true_gradient(model.env.envs[0].unwrapped.trajectories(), discounted_return)
+
+
+def assert_equal(gradient, expected):
+    th.testing.assert_close(gradient, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("ragged", [False, True])
+@pytest.mark.parametrize("reward_to_go", [False, True])
+@pytest.mark.parametrize("baseline", ["none", "leave_one_out"])
+def test_none_and_leave_one_out_are_unbiased(baseline, reward_to_go, ragged):
+    model = make_model(ragged, baseline=baseline, reward_to_go=reward_to_go)
+    assert_equal(expected_gradient(model), gradient_of_return(model))
+
+
+@pytest.mark.parametrize("ragged", [False, True])
+@pytest.mark.parametrize("reward_to_go", [False, True])
+@pytest.mark.parametrize("n_episodes", [3, 4])
+def test_optimal_is_unbiased(n_episodes, reward_to_go, ragged):
+    model = make_model(ragged, baseline="optimal", reward_to_go=reward_to_go, n_episodes=n_episodes)
+    assert_equal(expected_gradient(model, n_episodes), gradient_of_return(model))
+
+
+def test_optimal_in_sample_would_be_biased():
+    """What the test above guards against: the same scalar, estimated on the episodes that it is applied to."""
+
+    def in_sample(rollout):
+        products, squares = score_products(rollout)
+        return th.full_like(rollout.returns, float(products.sum() / squares.sum()))
+
+    model = make_model(baseline=in_sample, n_episodes=3)
+    assert (expected_gradient(model, 3) - gradient_of_return(model)).abs().max() > 1e-3
+
+
+def test_value_is_unbiased_whatever_the_critic_says():
+    model = make_model(baseline="value")
+    with th.no_grad():
+        model.policy.value_net.weight.normal_(std=10.0)
+    assert_equal(expected_gradient(model), gradient_of_return(model))
+
+
+@pytest.mark.parametrize("n_episodes", [2, 3])
+@pytest.mark.parametrize("reward_to_go", [False, True])
+def test_time_mean_is_short_by_one_nth(reward_to_go, n_episodes):
+    model = make_model(baseline="time_mean", reward_to_go=reward_to_go, n_episodes=n_episodes)
+    assert_equal(expected_gradient(model, n_episodes), (n_episodes - 1) / n_episodes * gradient_of_return(model))
+
+
+def test_mean_is_biased_as_documented():
+    """E[ĝ] = ∇E[Σ_t γ^t r_t] − ∇E[mean of the episode's returns] / N, for episodes of one length and no γ^t."""
+    model = make_model(baseline="mean", discount_scores=False)
+    without = expected_gradient(make_model(baseline="none", discount_scores=False))
+    trajectories = model.env.envs[0].unwrapped.trajectories()
+
+    def mean_return(trajectory):
+        return sum(discounted_return(trajectory, t) for t in range(2)) / 2
+
+    assert_equal(expected_gradient(model), without - true_gradient(trajectories, mean_return) / 2)
+
+
+def test_without_discounted_scores_the_gradient_is_another():
+    model = make_model(baseline="none", discount_scores=False)
+    assert (expected_gradient(model) - gradient_of_return(model)).abs().max() > 1e-2
+
+
+def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
+    """E[ĝ] = (E[Σ] − Cov(ĝ, steps)) / E[steps], where Σ is the sum before the division; not parallel to ∇E[G_0]."""
+    model = make_model(ragged=True, baseline="none", normalize_by="steps")
+    expect = partial(expectation, model, model.env.envs[0].unwrapped.trajectories(), 2)
+    gradient, steps, sums = expect(lambda g, n: g), expect(lambda g, n: n), expect(lambda g, n: g * n)
+    covariance = sums - gradient * steps
+    assert_equal(sums, 2 * gradient_of_return(model))
+    assert_equal(gradient, (sums - covariance) / steps)
+    assert th.cosine_similarity(gradient.flatten(), gradient_of_return(model).flatten(), dim=0) < 1 - 1e-4
+
+
+def test_dividing_by_steps_only_rescales_where_lengths_are_equal():
+    model = make_model(baseline="none", normalize_by="steps")
+    assert_equal(2 * expected_gradient(model), gradient_of_return(model))
+
+
+def episode_terms(trajectory, reward_to_go):
+    """A and S of an episode: Σ_t γ^t score_t G_t and Σ_t γ^t score_t, or Σ_t score_t G_0 and Σ_t score_t."""
+    discounts = [GAMMA ** (t * reward_to_go) for t in range(len(trajectory))]
+    returns = [discounted_return(trajectory, t * reward_to_go) for t in range(len(trajectory))]
+    scores = [score(node, action).flatten() for node, action, _ in trajectory]
+    weighted = [d * g * s for d, g, s in zip(discounts, returns, scores, strict=True)]
+    return sum(weighted), sum(d * s for d, s in zip(discounts, scores, strict=True))
+
+
+@pytest.mark.parametrize("reward_to_go", [False, True])
+def test_optimal_is_its_formula_on_the_other_episodes(reward_to_go):
+    model = make_model(ragged=True, baseline="optimal", reward_to_go=reward_to_go, n_episodes=3)
+    for batch in product(Tree(ragged=True).trajectories(), repeat=3):
+        buffer, ends = fill(model, batch)
+        extent = Extent.whole_episodes(3, 3, 1000)
+        rollout = weigh(model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(3), model._weighing)
+        ours = model._weighing.baseline(rollout)
+        terms = [episode_terms(trajectory, reward_to_go) for trajectory in batch]
+        for i in range(3):
+            others = [terms[j] for j in range(3) if j != i]
+            expected = sum(a @ s for a, s in others) / sum(s @ s for _, s in others)
+            th.testing.assert_close(ours[0, i], expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("reward_to_go", [False, True])
+def test_that_formula_minimizes_the_trace_of_the_covariance(reward_to_go):
+    trajectories = Tree().trajectories()
+    probabilities = th.stack(
+        [th.stack([log_pi(LOGITS, node, action) for node, action, _ in t]).sum().exp() for t in trajectories]
+    )
+    a, s = (th.stack(part) for part in zip(*(episode_terms(t, reward_to_go) for t in trajectories), strict=True))
+
+    def trace(constant):
+        gradients = a - constant * s
+        return probabilities @ (gradients - probabilities @ gradients).square().sum(1)
+
+    best = (probabilities @ (a * s).sum(1)) / (probabilities @ s.square().sum(1))
+    assert trace(best) < min(trace(best - 0.01), trace(best + 0.01))
+    assert abs(trace(best + 0.01) - trace(best - 0.01)) < 1e-10

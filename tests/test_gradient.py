@@ -1,0 +1,202 @@
+"""
+The step of one ``learn()`` against the formula of the class docstring, evaluated in float64 on what the environments
+have logged: a linear policy, plain gradient steps at rate 1, so that the parameters move by ĝ itself.
+
+Rewards are powers of ten and observations one-hot, so that every weight of every step can be read from ĝ.
+"""
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+
+GAMMA = 0.5
+N_OBS = 5
+
+
+class Logging(Corridor):
+    """Episodes of 1 to 5 steps; keeps (t, action, reward, whether the episode ended, and how) of every step."""
+
+    def __init__(self, truncate):
+        super().__init__((1, 2, 3, N_OBS), lambda t, action: 10.0**t * (1 + int(action)), truncate=truncate)
+        self.log = []
+
+    def step(self, action):
+        t = self.t
+        new_obs, reward, terminated, truncated, info = super().step(action)
+        self.log.append((t, int(action), reward, terminated, truncated))
+        return new_obs, reward, terminated, truncated, info
+
+
+def time_squared(rollout):
+    """A user's baseline."""
+    return rollout.timesteps.double() ** 2
+
+
+def learn(n_rollouts=1, n_envs=1, truncate=False, **kwargs):
+    """Train for some rollouts, at rate 0 until the last; return the model, the parameters before, and the logs."""
+    env = make_vec_env(lambda: Logging(truncate), n_envs, seed=0)
+    model = REINFORCE(
+        "MlpPolicy",
+        env,
+        learning_rate=lambda progress: float(progress < 0.5 / n_rollouts),
+        critic_learning_rate=0.0,
+        gamma=GAMMA,
+        policy_kwargs={"net_arch": [], "optimizer_class": th.optim.SGD},
+        seed=1,
+        device="cpu",
+        **kwargs,
+    )
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.normal_()
+    before = {name: parameter.double().numpy() for name, parameter in model.policy.state_dict().items()}
+    before = {name: parameter.copy() for name, parameter in before.items()}
+    model.learn(n_rollouts * (model.n_steps or 1) * n_envs)
+    return model, before, [wrapped.unwrapped.log for wrapped in env.envs]
+
+
+def step_of(model, before):
+    after = model.policy.state_dict()
+    return {name: after[name].double().numpy() - before[name] for name in ("action_net.weight", "action_net.bias")}
+
+
+def episodes_of(log):
+    """Cut a log into episodes; the last one may be unfinished."""
+    episodes = [[]]
+    for step in log:
+        episodes[-1].append(step)
+        if step[3] or step[4]:
+            episodes.append([])
+    return [episode for episode in episodes if episode]
+
+
+def one_hot(t):
+    return np.eye(N_OBS + 1)[t, :N_OBS]
+
+
+def formula(before, logs, baseline, n_episodes, n_steps, n_rollouts, reward_to_go, discount_scores, normalize_by, lam=1.0):
+    """ĝ of the last rollout, from the definitions."""
+
+    def value(t):
+        return (before["value_net.weight"] @ one_hot(t) + before["value_net.bias"]).item()
+
+    def score(t, action):
+        logits = before["action_net.weight"] @ one_hot(t) + before["action_net.bias"]
+        difference = np.eye(2)[action] - np.exp(logits) / np.exp(logits).sum()
+        return np.append(np.outer(difference, one_hot(t)).ravel(), difference)
+
+    critic, n_envs, used = baseline == "value", len(logs), []
+    for env, log in enumerate(logs):
+        quota = np.inf if n_steps else n_episodes // n_envs + (env < n_episodes % n_envs)
+        first_row = (n_rollouts - 1) * n_steps if n_steps else 0
+        row = 0
+        for number, episode in enumerate(episodes_of(log)):
+            rewards = [reward for _, _, reward, _, _ in episode]
+            _, _, _, terminated, truncated = episode[-1]
+            tail = value(len(episode)) if critic and not terminated else 0.0
+            values = [value(t) for t in range(len(episode))] + [tail]
+            for t, action, *_ in episode:
+                if reward_to_go:
+                    gae = sum(
+                        (GAMMA * lam) ** (k - t) * (rewards[k] + GAMMA * values[k + 1] - values[k])
+                        for k in range(t, len(episode))
+                    )
+                    to_go = sum(GAMMA ** (k - t) * rewards[k] for k in range(t, len(episode)))
+                    g = gae + values[t] if critic else to_go
+                else:
+                    g = sum(GAMMA**k * reward for k, reward in enumerate(rewards)) + GAMMA ** len(episode) * tail
+                known = critic or terminated or truncated
+                if known and number < quota and row >= first_row:
+                    d = GAMMA**t if discount_scores and reward_to_go else 1.0
+                    used.append((env, number, t, action, g, d, score(t, action)))
+                row += 1
+
+    def b(env, number, t):
+        same_t = [step for step in used if step[2] == t]
+        if baseline == "mean":
+            return np.mean([step[4] for step in used])
+        if baseline == "time_mean":
+            return np.mean([step[4] for step in same_t])
+        if baseline == "leave_one_out":
+            others = [step[4] for step in same_t if step[:2] != (env, number)]
+            return np.mean(others) if others else 0.0
+        if baseline == "optimal":
+            above = below = 0.0
+            for other in {step[:2] for step in used} - {(env, number)}:
+                steps = [step for step in used if step[:2] == other]
+                total_score = sum(step[5] * step[6] for step in steps)
+                above += sum(step[4] * step[5] * step[6] for step in steps) @ total_score
+                below += total_score @ total_score
+            return above / below if below else 0.0
+        return {"none": 0.0, "value": value(t), time_squared: float(t) ** 2}[baseline]
+
+    terms = np.array([d * s * (g - b(env, number, t)) for env, number, t, _, g, d, s in used])
+    scale = sum(np.abs(d * s) * (abs(g) + abs(b(env, number, t))) for env, number, t, _, g, d, s in used)
+    denominator = n_steps * n_envs if n_steps else (n_episodes if normalize_by == "episodes" else len(used))
+    return terms.sum(axis=0) / denominator, scale / denominator
+
+
+def assert_step_is(model, before, expected, scale):
+    """To float32 precision of what is summed up in each parameter; a wrong weight of one step would show as 1e-2."""
+    moved = step_of(model, before)
+    ours = np.append(moved["action_net.weight"].ravel(), moved["action_net.bias"])
+    assert (np.abs(ours - expected) <= 2e-5 * scale + 1e-5).all(), (ours, expected)
+
+
+@pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
+@pytest.mark.parametrize("n_envs", [1, 4])
+@pytest.mark.parametrize("truncate", [False, True])
+@pytest.mark.parametrize("reward_to_go", [False, True])
+@pytest.mark.parametrize(
+    ("n_steps", "n_episodes", "normalize_by", "n_rollouts"),
+    [(16, None, "steps", 1), (7, None, "episodes", 3), (None, 9, "steps", 1), (None, 6, "episodes", 1)],
+)
+@pytest.mark.parametrize("baseline", ["none", "mean", "time_mean", "leave_one_out", "value", "optimal", time_squared])
+def test_the_step_is_the_formula(baseline, n_steps, n_episodes, normalize_by, n_rollouts, reward_to_go, truncate, n_envs):
+    discount_scores = truncate == reward_to_go
+    arguments = dict(
+        baseline=baseline,
+        n_steps=n_steps,
+        n_episodes=n_episodes,
+        normalize_by=normalize_by,
+        reward_to_go=reward_to_go,
+        discount_scores=discount_scores,
+    )
+    model, before, logs = learn(n_rollouts, n_envs, truncate, **arguments)
+    assert_step_is(model, before, *formula(before, logs, n_rollouts=n_rollouts, **arguments))
+
+
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.9])
+@pytest.mark.parametrize("mode", [{"n_steps": 16, "n_episodes": None}, {"n_steps": None, "n_episodes": 9}])
+def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
+    arguments = dict(baseline="value", reward_to_go=True, discount_scores=False, normalize_by="steps", **mode)
+    model, before, logs = learn(1, 4, True, gae_lambda=gae_lambda, **arguments)
+    assert_step_is(model, before, *formula(before, logs, n_rollouts=1, lam=gae_lambda, **arguments))
+
+
+def test_normalized_advantages_have_mean_zero_and_deviation_one():
+    """The step with normalization is the step of weights shifted and scaled, denominator and all."""
+    plain, before, logs = learn(1, 4, baseline="none", n_steps=16, normalize_advantage=True, reward_to_go=True)
+    used = plain._rollout.used.numpy()
+    weights = plain.rollout_buffer.advantages[used].astype(np.float64)
+    weights = (weights - weights.mean()) / weights.std(ddof=1)
+    actions = plain.rollout_buffer.actions[used].ravel()
+    observations = plain.rollout_buffer.observations[used]
+    logits = observations @ before["action_net.weight"].T + before["action_net.bias"]
+    scores = np.eye(2)[actions] - np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    expected = (weights[:, None] * scores).T @ observations / (16 * 4)
+    np.testing.assert_allclose(step_of(plain, before)["action_net.weight"], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("max_grad_norm", [0.5, 3.0])
+def test_clipping_keeps_the_direction(max_grad_norm):
+    clipped, before, _ = learn(1, 1, baseline="none", n_episodes=4, max_grad_norm=max_grad_norm)
+    free, _, _ = learn(1, 1, baseline="none", n_episodes=4)
+    step, whole = (np.append(*map(np.ravel, step_of(model, before).values())) for model in (clipped, free))
+    assert np.linalg.norm(step) == pytest.approx(max_grad_norm, rel=1e-4)
+    np.testing.assert_allclose(step / max_grad_norm, whole / np.linalg.norm(whole), atol=1e-5)
+    assert clipped.logger.name_to_value["train/grad_norm"] == pytest.approx(np.linalg.norm(whole), rel=1e-5)
