@@ -178,6 +178,7 @@ def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
     assert_step_is(model, before, *formula(before, logs, n_rollouts=1, lam=gae_lambda, **arguments))
 
 
+@pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
 def test_normalized_advantages_have_mean_zero_and_deviation_one():
     """The step with normalization is the step of weights shifted and scaled, denominator and all."""
     plain, before, logs = learn(1, 4, baseline="none", n_steps=16, normalize_advantage=True, reward_to_go=True)

@@ -1,0 +1,82 @@
+"""Each baseline on grids drawn by hand, and the cases in which there is nothing to average."""
+
+import pytest
+import torch as th
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.baselines import BASELINES, leave_one_out, mean, none, time_mean
+from sb3_reinforce.rollouts import Rollout
+
+
+def make_rollout(returns, dones, timesteps, used=None, policy=None):
+    returns = th.tensor(returns, dtype=th.float64)
+    n_steps, n_envs = returns.shape
+    return Rollout(
+        observations=th.zeros(n_steps, n_envs, 4),
+        actions=th.zeros(n_steps, n_envs, 1),
+        rewards=th.zeros_like(returns),
+        dones=th.tensor(dones, dtype=th.bool),
+        timesteps=th.tensor(timesteps),
+        used=th.ones(n_steps, n_envs, dtype=th.bool) if used is None else th.tensor(used, dtype=th.bool),
+        returns=returns,
+        discounts=th.ones_like(returns),
+        values=None,
+        policy=policy,
+    )
+
+
+@pytest.fixture
+def two_environments():
+    """Three episodes: of 3 steps on the left, of 1 and 2 steps on the right; the last step on the right is not used."""
+    return make_rollout(
+        returns=[[10, 1], [20, 4], [30, 100]],
+        dones=[[0, 1], [0, 0], [1, 0]],
+        timesteps=[[0, 0], [1, 0], [2, 1]],
+        used=[[1, 1], [1, 1], [1, 0]],
+    )
+
+
+def test_episodes_are_numbered(two_environments):
+    assert two_environments.episodes.tolist() == [[0, 1], [0, 2], [0, 2]]
+
+
+def test_none_is_zero(two_environments):
+    assert none(two_environments).tolist() == [[0, 0]] * 3
+
+
+def test_mean_pools_all_used_steps(two_environments):
+    assert mean(two_environments)[two_environments.used].tolist() == [13.0] * 5
+
+
+def test_time_mean_averages_over_the_episodes_that_reach_t(two_environments):
+    ours = time_mean(two_environments)
+    assert ours[0].tolist() == [5, 5] and ours[1].tolist() == [20, 5] and ours[2, 0] == 30
+
+
+def test_leave_one_out_averages_over_the_other_ones(two_environments):
+    ours = leave_one_out(two_environments)
+    assert ours[0].tolist() == [2.5, 7] and ours[1].tolist() == [0, 5.5] and ours[2, 0] == 0
+
+
+def test_a_timestep_that_one_episode_reaches_has_a_defined_weight():
+    alone = make_rollout([[3.0], [5.0]], dones=[[0], [1]], timesteps=[[0], [1]])
+    assert time_mean(alone).tolist() == alone.returns.tolist()
+    assert leave_one_out(alone).tolist() == [[0], [0]]
+
+
+@pytest.mark.parametrize("baseline", ["mean", "time_mean", "leave_one_out", "optimal"])
+def test_a_batch_without_variance_has_no_gradient(baseline):
+    model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu")
+    same = make_rollout([[7.0, 7.0, 7.0]], [[1, 1, 1]], [[0, 0, 0]], policy=model.policy)
+    th.testing.assert_close(BASELINES[baseline](same), same.returns, rtol=1e-6, atol=0)
+
+
+def test_optimal_is_zero_where_no_other_episode_has_a_score():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu")
+    single = make_rollout([[7.0], [6.0]], [[0], [1]], [[0], [1]], policy=model.policy)
+    assert BASELINES["optimal"](single).tolist() == [[0], [0]]
+
+
+def test_timesteps_of_a_very_long_episode_cost_no_memory():
+    late = make_rollout([[1.0, 2.0]], [[1, 1]], [[10**12, 10**12]])
+    assert leave_one_out(late).tolist() == [[2, 1]]
