@@ -122,7 +122,7 @@ class REINFORCE(OnPolicyAlgorithm):
         gae_lambda: float = 1.0,
         ent_coef: float | Schedule = 0.0,
         vf_coef: float = 0.5,
-        max_grad_norm: float | None = None,
+        max_grad_norm: float | None = 0.5,
         baseline: str | Baseline = "value",
         n_episodes: int | None = None,
         reward_to_go: bool = True,

@@ -48,7 +48,7 @@ def learn(n_rollouts=1, n_envs=1, truncate=False, **kwargs):
         policy_kwargs={"net_arch": [], "optimizer_class": th.optim.SGD},
         seed=1,
         device="cpu",
-        **kwargs,
+        **{"max_grad_norm": None, **kwargs},
     )
     with th.no_grad():
         for parameter in model.policy.parameters():

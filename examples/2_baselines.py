@@ -1,0 +1,61 @@
+"""
+How much noise does each baseline leave in the gradient?
+
+The estimate stays the same on average, so all that a baseline can do is to lower the variance. Here every baseline
+weighs the very same episodes, and the trace of the covariance of the episodes' gradients is printed.
+
+    python examples/2_baselines.py
+"""
+
+import argparse
+from dataclasses import replace
+
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.baselines import BASELINES, none
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, split_parameters
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--timesteps", type=int, default=20_000)
+parser.add_argument("--episodes", type=int, default=100)
+arguments = parser.parse_args()
+th.set_num_threads(1)
+
+env = make_vec_env("CartPole-v1", n_envs=8, seed=arguments.seed)
+model = REINFORCE("MlpPolicy", env, gae_lambda=0.95, seed=arguments.seed, device="cpu").learn(arguments.timesteps)
+
+batch = []
+
+
+def keep(rollout):
+    """A baseline of one's own: 0, and the rollout is kept."""
+    batch.append(rollout)
+    return none(rollout)
+
+
+sampler = REINFORCE("MlpPolicy", env, learning_rate=0.0, baseline=keep, n_episodes=arguments.episodes, device="cpu")
+sampler.set_parameters(model.get_parameters())
+sampler.learn(1)
+policy, rollout = sampler.policy, batch[0]
+with th.no_grad():
+    values = policy.predict_values(rollout.observations.flatten(0, 1)).reshape(rollout.returns.shape).double()
+rollout = replace(rollout, values=values)
+
+traces = {}
+for name, baseline in BASELINES.items():
+    weights = (rollout.discounts * (rollout.returns - baseline(rollout))).float()
+    gradients = []
+    for episode in th.unique(rollout.episodes[rollout.used]):
+        steps = rollout.used & (rollout.episodes == episode)
+        actions = as_policy_actions(rollout.actions[steps], policy.action_space)
+        log_prob, _ = log_prob_and_entropy(policy, rollout.observations[steps], actions)
+        gradient = th.autograd.grad(weights[steps] @ log_prob, split_parameters(policy)[0])
+        gradients.append(th.cat([part.flatten() for part in gradient]))
+    traces[name] = th.stack(gradients).var(dim=0).sum().item()
+
+print(f"{'baseline':16s} {'trace of the covariance':>24s} {'of none':>8s}")
+for name, trace in traces.items():
+    print(f"{name:16s} {trace:24.1f} {trace / traces['none']:8.3f}")
