@@ -34,5 +34,7 @@ until_solved = EvalCallback(
 )
 model.learn(arguments.timesteps, callback=until_solved, progress_bar=True)
 
-mean, std = evaluate_policy(model, make_vec_env("CartPole-v1", n_envs=5, seed=2000 + arguments.seed), n_eval_episodes=100)
+mean, std = evaluate_policy(
+    model, make_vec_env("CartPole-v1", n_envs=5, seed=2000 + arguments.seed), n_eval_episodes=100
+)
 print(f"Mean return of 100 episodes after {model.num_timesteps} steps: {mean:.1f} +- {std:.1f}")

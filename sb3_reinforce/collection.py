@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_reinforce.actors import make_actor
 from sb3_reinforce.arguments import check_finite
-from sb3_reinforce.policies import act
 from sb3_reinforce.returns import Bools
 from sb3_reinforce.rollouts import Extent
 
@@ -57,7 +55,7 @@ def collect(
     :return: How the episodes ended; None if the callback stopped the collection
     :raises ValueError: If an episode that is waited for does not end
     """
-    policy, step = model.policy, 0
+    policy, actor, step = model.policy, make_actor(model.policy, env.num_envs), 0
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
@@ -65,21 +63,20 @@ def collect(
     while step < extent.n_steps and owed.any():
         if step == deadline:
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole episodes "
-                "are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
+                f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole "
+                "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
             )
         if step == buffer.buffer_size:
             resize(buffer, 2 * step)
         if model.use_sde and model.sde_sample_freq > 0 and step % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
-        sampled, values, log_prob = sample(policy, model._last_obs, step)
-        actions = sampled.cpu().numpy().reshape(env.num_envs, *model.action_space.shape)  # type: ignore[misc]
+        actions, values, log_prob = actor(model._last_obs)
         write(buffer.observations, step, model._last_obs)
         write(buffer.actions, step, actions)
         write(buffer.episode_starts, step, model._last_episode_starts)
         if values is not None and log_prob is not None:
-            write(buffer.values, step, values.cpu())
-            write(buffer.log_probs, step, log_prob.cpu())
+            write(buffer.values, step, values)
+            write(buffer.log_probs, step, log_prob)
 
         clipped_actions = as_env_actions(policy, actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
@@ -100,28 +97,10 @@ def collect(
             owed[wanted] -= 1
             begun[wanted] = step + 1
             deadline = extent.max_episode_steps + min(begun[owed > 0], default=0)
-        step += 1
+        buffer.pos = step = step + 1
     resize(buffer, step)
-    buffer.pos, buffer.full = step, True
+    buffer.full = True
     return Ends(np.stack(all_dones), terminal_obs)
-
-
-@th.no_grad()
-def sample(policy: ActorCriticPolicy, obs: Any, step: int) -> tuple[th.Tensor, th.Tensor | None, th.Tensor | None]:
-    """
-    ``act`` on the environments' observations, naming them where the policy refuses them because they are not finite.
-
-    :param policy: The policy
-    :param obs: Observations of the environments
-    :param step: The step of the rollout, for the message
-    :return: As ``act``
-    :raises ValueError: If an observation is not finite
-    """
-    try:
-        return act(policy, obs_as_tensor(obs, policy.device))
-    except ValueError:
-        check_finite("The observation", obs, (step,))
-        raise
 
 
 def as_env_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
@@ -186,17 +165,17 @@ def resize(buffer: RolloutBuffer, n_steps: int) -> None:
         buffer.buffer_size = n_steps
 
 
-def check_data(buffer: RolloutBuffer, last_obs: Any, ends: Ends) -> None:
+def check_data(buffer: RolloutBuffer, last_obs: Any, terminal_obs: dict[tuple[int, int], Any]) -> None:
     """
     Check what the environments returned.
 
-    :param buffer: The rollout buffer
+    :param buffer: The rollout buffer, full or not
     :param last_obs: The observations after the last step
-    :param ends: How the episodes ended
+    :param terminal_obs: The terminal observations at time limits
     :raises ValueError: Naming what is not finite, and the step and environment
     """
     check_finite("The reward", buffer.rewards)
     check_finite("The observation", buffer.observations)
-    check_finite("The observation", last_obs, (buffer.buffer_size,))
-    for where, obs in ends.terminal_obs.items():
+    check_finite("The observation", last_obs, (buffer.pos,))
+    for where, obs in terminal_obs.items():
         check_finite("The terminal observation", obs, where)

@@ -26,21 +26,6 @@ def overrides(policy: ActorCriticPolicy, method: str) -> bool:
     return getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
 
 
-def act(policy: ActorCriticPolicy, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor | None, th.Tensor | None]:
-    """
-    Sample actions, in one pass of the actor.
-
-    :param policy: The policy
-    :param obs: Observations of ``n_envs`` environments
-    :return: Actions of shape ``(n_envs, ...)``; and V(s) and log π(a|s), of shape ``(n_envs,)``, where the policy
-        overrides ``forward`` and so has just computed them, else None
-    """
-    if overrides(policy, "forward"):
-        actions, values, log_prob = policy(obs)
-        return actions, values.flatten(), log_prob.flatten()
-    return policy.get_distribution(obs).get_actions(), None, None
-
-
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
     """
     Stored actions in the form that ``evaluate_actions`` takes.

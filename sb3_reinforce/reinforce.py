@@ -267,10 +267,14 @@ class REINFORCE(OnPolicyAlgorithm):
             ends = collect(self, env, callback, rollout_buffer, extent)
             if ends is None:
                 return False
-            check_data(rollout_buffer, self._last_obs, ends)
+            check_data(rollout_buffer, self._last_obs, ends.terminal_obs)
             self._rollout = weigh(
                 self.policy, rollout_buffer, ends, self._last_obs, extent, self._running, self._weighing
             )
+        except Exception:
+            # It may have begun with a number that is not finite: then that is named instead
+            check_data(rollout_buffer, self._last_obs, {})
+            raise
         finally:
             if self._rollout is None:
                 # A rollout that is broken off is dropped, and the environments are reset before they are used again

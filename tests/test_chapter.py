@@ -53,7 +53,7 @@ LEFT, RIGHT = 0, 1
 
 
 def test_left_or_right():
-    """π(Right) = σ(θ) at θ = 0, episodes Right, Left, Right: the gradient is 5.5/3 = 1.83 and the step at 0.1 is 0.183."""
+    """π(Right) = σ(θ) at θ = 0, episodes Right, Left, Right: the gradient is 1.83 and the step at rate 0.1 is 0.183."""
     model = learn([-1.0, 5.0], [RIGHT, LEFT, RIGHT], baseline="none", learning_rate=0.1, max_grad_norm=None)
     theta = model.policy.action_net.weight[RIGHT].item()
     assert theta / 0.1 == pytest.approx((5 * 0.5 + 1 * 0.5 + 5 * 0.5) / 3, rel=1e-6)
@@ -65,7 +65,11 @@ def test_actions_with_returns_8_10_12():
     """With the mean as baseline the average action gets no push, and the others −2 and 2."""
     model = learn([8.0, 10.0, 12.0], [0, 1, 2], baseline="mean")
     assert model.rollout_buffer.advantages.ravel().tolist() == [-2, 0, 2]
-    assert learn([8.0, 10.0, 12.0], [0, 1, 2], baseline="none").rollout_buffer.advantages.ravel().tolist() == [8, 10, 12]
+    assert learn([8.0, 10.0, 12.0], [0, 1, 2], baseline="none").rollout_buffer.advantages.ravel().tolist() == [
+        8,
+        10,
+        12,
+    ]
 
 
 def gradient_of_log_prob(policy, obs, action, parameter):

@@ -57,7 +57,10 @@ OBSERVATIONS = {
     "multi_discrete": (spaces.MultiDiscrete([2, 3]), "MlpPolicy"),
     "multi_binary": (spaces.MultiBinary(3), "MlpPolicy"),
     "image": (IMAGE, "CnnPolicy"),
-    "dict": (spaces.Dict({"image": IMAGE, "flat": spaces.Box(-1, 1, (3,)), "n": spaces.Discrete(3)}), "MultiInputPolicy"),
+    "dict": (
+        spaces.Dict({"image": IMAGE, "flat": spaces.Box(-1, 1, (3,)), "n": spaces.Discrete(3)}),
+        "MultiInputPolicy",
+    ),
 }
 ACTIONS = {
     "discrete": spaces.Discrete(3),
@@ -82,7 +85,9 @@ def assert_trains(model):
 def test_observation_spaces(name, mode):
     space, policy = OBSERVATIONS[name]
     env = make_vec_env(lambda: AnySpace(space), 2, seed=0)
-    model = REINFORCE(policy, env, baseline=mode.get("baseline", "value"), **{k: v for k, v in mode.items() if k != "baseline"})
+    model = REINFORCE(
+        policy, env, baseline=mode.get("baseline", "value"), **{k: v for k, v in mode.items() if k != "baseline"}
+    )
     model.learn(30)
     model.predict(env.reset())
 
@@ -328,7 +333,11 @@ def test_schedules_are_followed():
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "MultiDiscrete", "MultiBinary"])
 def test_temperature_divides_the_logits(env_id):
-    env = env_id if "-" in env_id else Corridor(action_space=ACTIONS[{"MultiDiscrete": "multi_discrete"}.get(env_id, "multi_binary")])
+    env = (
+        env_id
+        if "-" in env_id
+        else Corridor(action_space=ACTIONS[{"MultiDiscrete": "multi_discrete"}.get(env_id, "multi_binary")])
+    )
     models = [REINFORCE("MlpPolicy", env, temperature=t, seed=0, device="cpu") for t in (1.0, 0.25)]
     with th.no_grad():
         models[0].policy.action_net.weight.mul_(4)

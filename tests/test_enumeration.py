@@ -89,7 +89,9 @@ def estimate(model, batch):
     """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
     buffer, ends = fill(model, batch)
     extent = Extent.whole_episodes(len(batch), len(batch), 1000)
-    rollout = weigh(model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing)
+    rollout = weigh(
+        model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing
+    )
     weights = rollout.discounts * (rollout.returns - model._weighing.baseline(rollout)) * rollout.used
     terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
     return sum(terms) / model._denominator(rollout), int(rollout.used.sum())

@@ -79,7 +79,7 @@ def test_arguments_that_do_not_go_together(arguments, words):
 
 def test_temperature_is_for_discrete_actions():
     for temperature in (0.5, lambda progress: 1.0):
-        with pytest.raises(ValueError, match="temperature.*Box"):
+        with pytest.raises(ValueError, match=r"temperature.*Box"):
             REINFORCE("MlpPolicy", "Pendulum-v1", temperature=temperature)
 
 
@@ -170,7 +170,9 @@ def assert_saveable_and_trainable(model, path):
 
 @pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 2, "baseline": "none"}])
 @pytest.mark.parametrize("action_space", [spaces.Discrete(2), spaces.Box(-1, 1, (2,))])
-@pytest.mark.parametrize(("fault", "value"), [("reward", NAN), ("reward", -INF), ("observation", NAN), ("observation", INF)])
+@pytest.mark.parametrize(
+    ("fault", "value"), [("reward", NAN), ("reward", -INF), ("observation", NAN), ("observation", INF)]
+)
 def test_data_that_are_not_finite_are_named_before_the_parameters_are_touched(
     fault, value, action_space, mode, tmp_path
 ):
@@ -191,7 +193,9 @@ def test_data_that_are_not_finite_are_named_before_the_parameters_are_touched(
     assert_saveable_and_trainable(model, tmp_path / "model")
 
 
-@pytest.mark.parametrize(("length", "truncate", "name"), [(8, True, "terminal observation"), (100, False, "observation")])
+@pytest.mark.parametrize(
+    ("length", "truncate", "name"), [(8, True, "terminal observation"), (100, False, "observation")]
+)
 def test_the_last_observation_of_a_rollout_is_checked_too(length, truncate, name):
     """Of the very last rollout, in which the critic's value of it would end up in the returns."""
     env = Faulty("observation", at=7, length=length, truncate=truncate)

@@ -78,7 +78,9 @@ def one_hot(t):
     return np.eye(N_OBS + 1)[t, :N_OBS]
 
 
-def formula(before, logs, baseline, n_episodes, n_steps, n_rollouts, reward_to_go, discount_scores, normalize_by, lam=1.0):
+def formula(
+    before, logs, baseline, n_episodes, n_steps, n_rollouts, reward_to_go, discount_scores, normalize_by, lam=1.0
+):
     """ĝ of the last rollout, from the definitions."""
 
     def value(t):
@@ -156,7 +158,9 @@ def assert_step_is(model, before, expected, scale):
     [(16, None, "steps", 1), (7, None, "episodes", 3), (None, 9, "steps", 1), (None, 6, "episodes", 1)],
 )
 @pytest.mark.parametrize("baseline", ["none", "mean", "time_mean", "leave_one_out", "value", "optimal", time_squared])
-def test_the_step_is_the_formula(baseline, n_steps, n_episodes, normalize_by, n_rollouts, reward_to_go, truncate, n_envs):
+def test_the_step_is_the_formula(
+    baseline, n_steps, n_episodes, normalize_by, n_rollouts, reward_to_go, truncate, n_envs
+):
     discount_scores = truncate == reward_to_go
     arguments = dict(
         baseline=baseline,
@@ -181,7 +185,7 @@ def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
 @pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
 def test_normalized_advantages_have_mean_zero_and_deviation_one():
     """The step with normalization is the step of weights shifted and scaled, denominator and all."""
-    plain, before, logs = learn(1, 4, baseline="none", n_steps=16, normalize_advantage=True, reward_to_go=True)
+    plain, before, _ = learn(1, 4, baseline="none", n_steps=16, normalize_advantage=True, reward_to_go=True)
     used = plain._rollout.used.numpy()
     weights = plain.rollout_buffer.advantages[used].astype(np.float64)
     weights = (weights - weights.mean()) / weights.std(ddof=1)

@@ -90,7 +90,9 @@ def test_total_return_is_the_reward_to_go_of_the_first_step(rollout, gamma):
     ours = total_return(reward_to_go(rewards, dones, gamma), timesteps, gamma, np.zeros(N_ENVS))
     np.testing.assert_allclose(ours, expected, atol=1e-12)
 
-    earlier = [[gamma**k * rewards[10 - timesteps[10, i] + k, i] for k in range(timesteps[10, i])] for i in range(N_ENVS)]
+    earlier = [
+        [gamma**k * rewards[10 - timesteps[10, i] + k, i] for k in range(timesteps[10, i])] for i in range(N_ENVS)
+    ]
     second_half = total_return(
         reward_to_go(rewards[10:], dones[10:], gamma), timesteps[10:], gamma, np.array([sum(part) for part in earlier])
     )

@@ -1,0 +1,166 @@
+"""
+How a policy acts while a rollout is collected.
+
+``general_actor`` asks the policy itself, whatever it is. ``laid_out_actor`` is the same actor for the usual case, a
+plain MLP on flat observations, as a few NumPy operations: on a handful of observations PyTorch's modules and
+distributions take far longer than the arithmetic. Both draw from the same distribution, but not the same actions for
+the same seed: the laid-out one draws its noise for many steps at once, in the form that the distribution needs.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    MultiCategoricalDistribution,
+)
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_reinforce.policies import overrides
+
+Floats: TypeAlias = NDArray[np.float32]
+# Observations -> actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
+Actor: TypeAlias = Callable[[Any], tuple[np.ndarray, np.ndarray | None, np.ndarray | None]]
+
+# What a subclass may have changed on the way from an observation to an action
+ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
+# Steps for which noise is drawn at once
+NOISE_STEPS = 128
+
+
+def make_actor(policy: ActorCriticPolicy, n_envs: int) -> Actor:
+    """
+    The fastest way to act with a policy, as long as its parameters stay as they are.
+
+    :param policy: The policy
+    :param n_envs: Number of observations at a time
+    """
+    layers = plain_layers(policy)
+    return general_actor(policy) if layers is None else laid_out_actor(policy, layers, n_envs)
+
+
+def general_actor(policy: ActorCriticPolicy) -> Actor:
+    """
+    Act through the policy: through its ``forward`` if it has one of its own, else through the actor alone.
+
+    :param policy: Any policy
+    """
+    device, shape = policy.device, policy.action_space.shape or ()
+
+    @th.no_grad()
+    def act(obs: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        if overrides(policy, "forward"):
+            actions, values, log_prob = policy(obs_as_tensor(obs, device))
+            return actions.cpu().numpy().reshape(-1, *shape), values.cpu().numpy(), log_prob.cpu().numpy()
+        actions = policy.get_distribution(obs_as_tensor(obs, device)).get_actions()
+        return actions.cpu().numpy().reshape(-1, *shape), None, None
+
+    return act
+
+
+def laid_out_actor(policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int) -> Actor:
+    """
+    Act by NumPy: the layers one after the other, and noise drawn beforehand.
+
+    :param policy: The policy
+    :param layers: Its layers, as ``plain_layers`` gives them
+    :param n_envs: Number of observations at a time
+    """
+    functions, shape = [as_function(layer) for layer in layers], policy.action_space.shape or ()
+    sample, noise = make_sampler(policy), make_noise(policy, n_envs)
+
+    def act(obs: np.ndarray) -> tuple[np.ndarray, None, None]:
+        x = obs.reshape(n_envs, -1).astype(np.float32, copy=False)
+        for function in functions:
+            x = function(x)
+        return sample(x, next(noise)).reshape(n_envs, *shape), None, None
+
+    return act
+
+
+def plain_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
+    """
+    The actor's layers, if all that it does is to apply linear layers, tanh and ReLU to flat observations.
+
+    :param policy: The policy
+    :return: The layers from the observation to the parameters of the action distribution; None if the policy is another
+        kind, is compiled, overrides a method on the way, or carries forward hooks
+    """
+    if any(overrides(policy, method) for method in ACTOR_METHODS) or type(policy.mlp_extractor) is not MlpExtractor:
+        return None
+    space, extractor = policy.observation_space, policy.pi_features_extractor
+    layers = [*policy.mlp_extractor.policy_net, policy.action_net]
+    is_plain = (
+        isinstance(space, spaces.Box)
+        and not is_image_space(space)
+        and type(extractor) is FlattenExtractor
+        and not policy.use_sde
+        and all(type(layer) in (th.nn.Linear, th.nn.Tanh, th.nn.ReLU) for layer in layers)
+        and not any(module._forward_hooks or module._forward_pre_hooks for module in (policy, extractor, *layers))
+    )
+    return layers if is_plain else None
+
+
+def as_function(layer: th.nn.Module) -> Callable[[Floats], Floats]:
+    """
+    A layer as a function of arrays of shape ``(n, n_in)``.
+
+    :param layer: ``Linear``, ``Tanh`` or ``ReLU``
+    """
+    if isinstance(layer, th.nn.Linear):
+        weight, bias = (parameter.detach().cpu().numpy() for parameter in (layer.weight.T.contiguous(), layer.bias))
+        return lambda x: x @ weight + bias
+    return np.tanh if isinstance(layer, th.nn.Tanh) else lambda x: np.maximum(x, 0)
+
+
+def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:
+    """
+    The noise of each step, from PyTorch's generator.
+
+    Gumbel noise ``−log E`` with E exponential for categorical actions, logistic ``log(u / (1 − u))`` for binary ones,
+    normal noise for Gaussian ones.
+
+    :param policy: The policy
+    :param n_envs: Number of environments
+    :return: Arrays of shape ``(n_envs, width)``, without end; ``width`` is the number of logits or means
+    """
+    size = (NOISE_STEPS, n_envs, cast(th.nn.Linear, policy.action_net).out_features)
+    while True:
+        if isinstance(policy.action_dist, DiagGaussianDistribution):
+            yield from th.randn(size).numpy()
+        elif isinstance(policy.action_dist, BernoulliDistribution):
+            yield from th.rand(size).logit_().numpy()
+        else:
+            yield from th.empty(size).exponential_().log_().neg_().numpy()
+
+
+def make_sampler(policy: ActorCriticPolicy) -> Callable[[Floats, Floats], np.ndarray]:
+    """
+    How parameters of the action distribution and noise, both ``(n_envs, width)``, become actions.
+
+    ``argmax(logits + Gumbel)`` is categorical (Gumbel, 1954), ``logits + logistic > 0`` is Bernoulli with the logits'
+    probability, and ``mean + σ · normal`` is Gaussian.
+
+    :param policy: The policy
+    """
+    distribution = policy.action_dist
+    if isinstance(distribution, DiagGaussianDistribution):
+        std = policy.log_std.detach().exp().cpu().numpy()
+        return lambda mean, normal: mean + std * normal
+    if isinstance(distribution, BernoulliDistribution):
+        return lambda logits, logistic: (logits + logistic > 0).astype(np.float32)
+    if isinstance(distribution, CategoricalDistribution):
+        return lambda logits, gumbel: (logits + gumbel).argmax(axis=1)
+    cuts = np.cumsum(cast(MultiCategoricalDistribution, distribution).action_dims)[:-1]
+    return lambda logits, gumbel: np.stack(
+        [part.argmax(axis=1) for part in np.split(logits + gumbel, cuts, axis=1)], axis=1
+    )

@@ -1,0 +1,96 @@
+"""The laid-out actor is the policy: the same function of the observation, and the same distribution of actions."""
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.actors import general_actor, laid_out_actor, make_noise, make_sampler, plain_layers
+
+SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
+N_DRAWS = 4000
+
+
+def make_policy(space=SPACES[0], policy="MlpPolicy", **kwargs):
+    """A policy with weights so large that actions depend on observations."""
+    th.manual_seed(0)
+    model = REINFORCE(policy, Corridor((5,), action_space=space), device="cpu", **kwargs)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.normal_(std=0.2)
+    return model.policy
+
+
+@pytest.mark.parametrize("space", SPACES, ids=str)
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
+def test_without_noise_it_is_the_mode(space, activation_fn, monkeypatch):
+    policy = make_policy(space, policy_kwargs={"activation_fn": activation_fn})
+    obs = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
+    zeros = iter([np.zeros((50, policy.action_net.out_features), dtype=np.float32)])
+    monkeypatch.setattr("sb3_reinforce.actors.make_noise", lambda *args: zeros)
+    actions, _, _ = laid_out_actor(policy, plain_layers(policy), 50)(obs)
+    with th.no_grad():
+        mode = policy.get_distribution(obs_as_tensor(obs, "cpu")).mode().numpy()
+    np.testing.assert_allclose(actions, mode.reshape(50, *space.shape), rtol=1e-5, atol=1e-6)
+    assert actions.dtype == mode.dtype
+
+
+@pytest.mark.parametrize("actor", ["laid out", "general"])
+@pytest.mark.parametrize("space", SPACES, ids=str)
+def test_actions_are_drawn_from_the_policys_distribution(space, actor):
+    """The mean score of the draws is 0 to within its standard error: for no other distribution is E[∇ log π] = 0."""
+    policy = make_policy(space)
+    obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
+    act = laid_out_actor(policy, plain_layers(policy), N_DRAWS) if actor == "laid out" else general_actor(policy)
+    actions = th.as_tensor(act(obs)[0]).reshape(N_DRAWS, -1).float()
+    actions = actions.flatten() if isinstance(space, spaces.Discrete) else actions
+    distribution = policy.get_distribution(obs_as_tensor(obs[:1], "cpu"))
+    parameters = [policy.action_net.bias, *([policy.log_std] if hasattr(policy, "log_std") else [])]
+    scores = th.stack([
+        th.cat(th.autograd.grad(distribution.log_prob(action[None]).sum(), parameters, retain_graph=True))
+        for action in actions
+    ])  # fmt: skip
+    assert (scores.mean(0).abs() < 4 * scores.std(0) / N_DRAWS**0.5).all()
+    assert (scores.std(0) > 0).all()
+
+
+def test_noise_is_that_of_its_distribution():
+    """Draws of the sampler from given logits, against the probabilities of the softmax."""
+    policy = make_policy(spaces.Discrete(3))
+    noise, sample = make_noise(policy, 10_000), make_sampler(policy)
+    logits = th.tensor([1.0, -0.5, 0.2])
+    actions = sample(np.tile(logits.numpy(), (10_000, 1)), next(noise))
+    shares = np.bincount(actions, minlength=3) / 10_000
+    np.testing.assert_allclose(shares, logits.softmax(0), atol=4 * 0.5 / 100)
+    assert not np.array_equal(next(noise), next(noise))
+
+
+class Changed(ActorCriticPolicy):
+    def extract_features(self, obs, features_extractor=None):
+        return super().extract_features(obs, features_extractor)
+
+
+def test_whatever_is_not_plain_goes_the_general_way():
+    assert plain_layers(make_policy()) is not None
+    assert plain_layers(make_policy(policy=Changed)) is None
+    assert plain_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
+    assert plain_layers(make_policy(temperature=0.5)) is None
+    assert plain_layers(make_policy(SPACES[3], use_sde=True)) is None
+    assert plain_layers(th.compile(make_policy(), backend="eager")) is None
+    hooked = make_policy()
+    hooked.mlp_extractor.policy_net[0].register_forward_hook(lambda module, inputs, output: output * 0)
+    assert plain_layers(hooked) is None
+
+
+def test_each_rollout_acts_with_the_parameters_of_the_last_update():
+    """A laid-out actor that were not refreshed would go on as it began."""
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=20, learning_rate=0.0, seed=0)
+    model.learn(20)
+    with th.no_grad():
+        model.policy.action_net.bias.copy_(th.tensor([-100.0, 100.0]))
+    model.learn(20)
+    assert (model.rollout_buffer.actions == 1).all()
