@@ -1,7 +1,7 @@
 """
 How a policy acts while a rollout is collected.
 
-``general_actor`` asks the policy itself, whatever it is. ``laid_out_actor`` is the same actor for the usual case, a
+``GeneralActor`` asks the policy itself, whatever it is. ``LaidOutActor`` is the same actor for the usual case, a
 plain MLP on flat observations, as a few NumPy operations: on a handful of observations PyTorch's modules and
 distributions take far longer than the arithmetic. Both draw from the same distribution, but not the same actions for
 the same seed: the laid-out one draws its noise for many steps at once, in the form that the distribution needs.
@@ -25,11 +25,12 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.policies import overrides
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, overrides
+from sb3_reinforce.rollouts import flatten
 
 Floats: TypeAlias = NDArray[np.float32]
-# Observations -> actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
-Actor: TypeAlias = Callable[[Any], tuple[np.ndarray, np.ndarray | None, np.ndarray | None]]
+# Actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
+Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
 # What a subclass may have changed on the way from an observation to an action
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
@@ -37,7 +38,86 @@ ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action
 NOISE_STEPS = 128
 
 
-def make_actor(policy: ActorCriticPolicy, n_envs: int) -> Actor:
+class GeneralActor:
+    """
+    Acts through the policy: through its ``forward`` if it has one of its own, else through the actor alone.
+
+    :param policy: Any policy
+    """
+
+    def __init__(self, policy: ActorCriticPolicy):
+        self.policy, self.device, self.shape = policy, policy.device, policy.action_space.shape or ()
+        self.has_own_forward = overrides(policy, "forward")
+
+    @th.no_grad()
+    def act(self, obs: Any) -> Acted:
+        """
+        Draw actions.
+
+        :param obs: Observations of ``n_envs`` environments, an array or a dict of arrays
+        """
+        obs = obs_as_tensor(obs, self.device)
+        if not self.has_own_forward:
+            return self.policy.get_distribution(obs).get_actions().cpu().numpy().reshape(-1, *self.shape), None, None
+        actions, values, log_prob = self.policy(obs)
+        return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
+
+    @th.no_grad()
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+        """
+        log π(a|s) of all that was done, in one batch: the parameters do not change during a rollout.
+
+        :param obs: All observations, shape ``(n_steps, n_envs, ...)`` or a dict of such arrays
+        :param actions: All actions, shape ``(n_steps, n_envs, action_dim)``
+        :return: Shape ``(n_steps * n_envs,)``
+        """
+        steps = as_policy_actions(th.as_tensor(actions, device=self.device).flatten(0, 1), self.policy.action_space)
+        return log_prob_and_entropy(self.policy, flatten(obs_as_tensor(obs, self.device)), steps)[0].cpu().numpy()
+
+
+class LaidOutActor:
+    """
+    Acts by NumPy: the layers one after the other, and noise drawn beforehand.
+
+    :param policy: A policy whose actor is a plain MLP
+    :param layers: Its layers, as ``plain_layers`` gives them, with the parameters that they have now
+    :param n_envs: Number of observations at a time
+    """
+
+    def __init__(self, policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int):
+        self.policy, self.shape = policy, (n_envs, *(policy.action_space.shape or ()))
+        self.functions = [as_function(layer) for layer in layers]
+        self.sample, self.noise = make_sampler(policy), make_noise(policy, n_envs)
+        self.outputs: list[Floats] = []
+
+    def act(self, obs: Any) -> Acted:
+        """
+        Draw actions, and keep the logits or means that they are drawn from.
+
+        :param obs: Observations of ``n_envs`` environments
+        """
+        x = obs.reshape(len(obs), -1).astype(np.float32, copy=False)
+        for function in self.functions:
+            x = function(x)
+        self.outputs.append(x)
+        return self.sample(x, next(self.noise)).reshape(self.shape), None, None
+
+    @th.no_grad()
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+        """
+        log π(a|s) of all that was done, from the logits or means that were kept.
+
+        :param obs: Not needed
+        :param actions: All actions, shape ``(n_steps, n_envs, action_dim)``
+        :return: Shape ``(n_steps * n_envs,)``
+        """
+        distribution, outputs = self.policy.action_dist, th.as_tensor(np.concatenate(self.outputs))
+        steps = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
+        log_std = [self.policy.log_std.cpu()] if isinstance(distribution, DiagGaussianDistribution) else []
+        return distribution.proba_distribution(outputs, *log_std).log_prob(steps).numpy()
+
+
+def make_actor(policy: ActorCriticPolicy, n_envs: int) -> GeneralActor | LaidOutActor:
     """
     The fastest way to act with a policy, as long as its parameters stay as they are.
 
@@ -45,46 +125,7 @@ def make_actor(policy: ActorCriticPolicy, n_envs: int) -> Actor:
     :param n_envs: Number of observations at a time
     """
     layers = plain_layers(policy)
-    return general_actor(policy) if layers is None else laid_out_actor(policy, layers, n_envs)
-
-
-def general_actor(policy: ActorCriticPolicy) -> Actor:
-    """
-    Act through the policy: through its ``forward`` if it has one of its own, else through the actor alone.
-
-    :param policy: Any policy
-    """
-    device, shape = policy.device, policy.action_space.shape or ()
-
-    @th.no_grad()
-    def act(obs: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-        if overrides(policy, "forward"):
-            actions, values, log_prob = policy(obs_as_tensor(obs, device))
-            return actions.cpu().numpy().reshape(-1, *shape), values.cpu().numpy(), log_prob.cpu().numpy()
-        actions = policy.get_distribution(obs_as_tensor(obs, device)).get_actions()
-        return actions.cpu().numpy().reshape(-1, *shape), None, None
-
-    return act
-
-
-def laid_out_actor(policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int) -> Actor:
-    """
-    Act by NumPy: the layers one after the other, and noise drawn beforehand.
-
-    :param policy: The policy
-    :param layers: Its layers, as ``plain_layers`` gives them
-    :param n_envs: Number of observations at a time
-    """
-    functions, shape = [as_function(layer) for layer in layers], policy.action_space.shape or ()
-    sample, noise = make_sampler(policy), make_noise(policy, n_envs)
-
-    def act(obs: np.ndarray) -> tuple[np.ndarray, None, None]:
-        x = obs.reshape(n_envs, -1).astype(np.float32, copy=False)
-        for function in functions:
-            x = function(x)
-        return sample(x, next(noise)).reshape(n_envs, *shape), None, None
-
-    return act
+    return GeneralActor(policy) if layers is None else LaidOutActor(policy, layers, n_envs)
 
 
 def plain_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:

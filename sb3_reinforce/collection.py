@@ -70,7 +70,7 @@ def collect(
             resize(buffer, 2 * step)
         if model.use_sde and model.sde_sample_freq > 0 and step % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
-        actions, values, log_prob = actor(model._last_obs)
+        actions, values, log_prob = actor.act(model._last_obs)
         write(buffer.observations, step, model._last_obs)
         write(buffer.actions, step, actions)
         write(buffer.episode_starts, step, model._last_episode_starts)
@@ -100,6 +100,8 @@ def collect(
         buffer.pos = step = step + 1
     resize(buffer, step)
     buffer.full = True
+    if log_prob is None:
+        buffer.log_probs = actor.log_prob(buffer.observations, buffer.actions).reshape(buffer.rewards.shape)
     return Ends(np.stack(all_dones), terminal_obs)
 
 

@@ -12,29 +12,24 @@ from torch.nn import functional as F
 
 from sb3_reinforce import optimization
 from sb3_reinforce.collection import Ends
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, overrides
+from sb3_reinforce.policies import overrides
 from sb3_reinforce.returns import Floats
 from sb3_reinforce.rollouts import flatten, take
 
 
 @th.no_grad()
-def evaluate(policy: ActorCriticPolicy, buffer: RolloutBuffer, has_critic: bool) -> None:
+def values_of(policy: ActorCriticPolicy, buffer: RolloutBuffer) -> np.ndarray:
     """
-    Write V(s_t) and log π(a_t|s_t) into a rollout buffer, each in one batch: the parameters do not change during a
-    rollout. A policy that overrides ``forward`` has computed them at each step already.
+    V(s_t) in one batch, or as a policy that overrides ``forward`` has told it step by step.
 
     :param policy: The policy
     :param buffer: The rollout buffer
-    :param has_critic: Whether V is wanted
+    :return: Shape ``(n_steps, n_envs)``, float32
     """
     if overrides(policy, "forward"):
-        return
+        return buffer.values
     obs = flatten(obs_as_tensor(buffer.observations, policy.device))
-    actions = as_policy_actions(th.as_tensor(buffer.actions, device=policy.device).flatten(0, 1), policy.action_space)
-    log_prob, _ = log_prob_and_entropy(policy, obs, actions)
-    buffer.log_probs = log_prob.reshape(buffer.rewards.shape).cpu().numpy()
-    if has_critic:
-        buffer.values = policy.predict_values(obs).reshape(buffer.rewards.shape).cpu().numpy()
+    return policy.predict_values(obs).reshape(buffer.rewards.shape).cpu().numpy()
 
 
 @th.no_grad()

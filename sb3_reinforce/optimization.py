@@ -1,8 +1,8 @@
 """One optimizer step from given gradients, refused before anything is changed if a gradient is not finite."""
 
+import math
 from collections.abc import Sequence
 
-import numpy as np
 import torch as th
 
 
@@ -26,16 +26,28 @@ def step(
     :return: The norm before clipping
     :raises ValueError: If the norm is not finite; parameters and optimizer stay as they were
     """
-    optimizer.zero_grad()
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
-    norm = float(th.nn.utils.clip_grad_norm_(parameters, np.inf if max_grad_norm is None else max_grad_norm))
-    if np.isfinite(norm):
-        optimizer.step()
-    optimizer.zero_grad()
-    if not np.isfinite(norm):
+    flat = [gradient.flatten() for gradient in gradients if gradient is not None]
+    norm = float(th.linalg.vector_norm(th.cat(flat)))
+    if not math.isfinite(norm):
         raise ValueError(
             f"The gradient of the {name} is not finite (norm {norm}). The parameters are those before this step; a "
             "lower learning_rate, a max_grad_norm or scaled rewards (VecNormalize) may help"
         )
+    scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
+    optimizer.zero_grad()
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient if gradient is None or scale == 1 else gradient * scale
+    optimizer.step()
+    optimizer.zero_grad()
     return norm
+
+
+def fuse(optimizer: th.optim.Optimizer) -> None:
+    """
+    Let Adam do its step in one kernel, a fourth of the time for small networks, unless the user has chosen otherwise.
+
+    :param optimizer: Any optimizer; only Adam and AdamW are changed
+    """
+    if type(optimizer) in (th.optim.Adam, th.optim.AdamW):
+        for group in optimizer.param_groups:
+            group["fused"] = group["fused"] is not False and not group["foreach"]

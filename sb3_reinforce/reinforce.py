@@ -218,6 +218,8 @@ class REINFORCE(OnPolicyAlgorithm):
             lr=self.critic_lr_schedule(1),  # type: ignore[call-arg]
             **self.policy.optimizer_kwargs,
         )
+        for optimizer in (self.policy.optimizer, self.critic_optimizer):
+            optimization.fuse(optimizer)
         self._temperature = th.ones((), device=self.device)
         self._update_temperature()
         if self.temperature != 1:

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_reinforce import baselines
 from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import Ends
-from sb3_reinforce.critic import evaluate, values_after
+from sb3_reinforce.critic import values_after, values_of
 from sb3_reinforce.returns import Bools, Floats, Integers, lambda_return, reward_to_go, total_return
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, timesteps_of, within_quota
 
@@ -89,8 +89,8 @@ def weigh(
     Compute G_t and G_t − b_t of a collected rollout, and complete the rollout buffer with them.
 
     :param policy: The policy that acted
-    :param buffer: The rollout buffer: gets ``values``, ``log_probs``, ``advantages`` (G_t − b_t) and ``returns`` (what
-        a critic is fitted to, without one G_t); the latter two are 0 at steps that are not used
+    :param buffer: The rollout buffer: gets ``values``, ``advantages`` (G_t − b_t) and ``returns`` (what a critic is
+        fitted to, without one G_t); the latter two are 0 at steps that are not used
     :param ends: How the episodes ended
     :param last_obs: The observations after the last step
     :param extent: What was to be collected
@@ -103,8 +103,10 @@ def weigh(
     timesteps = timesteps_of(dones, running.timesteps)
     used = within_quota(dones, extent.quota) & (weighing.has_critic | in_finished_episode(dones))
     check_used(used, extent)
-    evaluate(policy, buffer, weighing.has_critic)
-    next_values = values_after(policy, buffer.values, last_obs, ends) if weighing.has_critic else 0.0
+    next_values: Floats | float = 0.0
+    if weighing.has_critic:
+        buffer.values = values_of(policy, buffer)
+        next_values = values_after(policy, buffer.values, last_obs, ends)
     returns_to_go = lambda_return(rewards, dones, next_values, gamma, weighing.gae_lambda)
     total_returns = total_return(returns_to_go, timesteps, gamma, running.rewards)
     returns = returns_to_go if weighing.reward_to_go else total_returns

@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.actors import general_actor, laid_out_actor, make_noise, make_sampler, plain_layers
+from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_noise, make_sampler, plain_layers
 
 SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
 N_DRAWS = 4000
@@ -32,7 +32,7 @@ def test_without_noise_it_is_the_mode(space, activation_fn, monkeypatch):
     obs = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
     zeros = iter([np.zeros((50, policy.action_net.out_features), dtype=np.float32)])
     monkeypatch.setattr("sb3_reinforce.actors.make_noise", lambda *args: zeros)
-    actions, _, _ = laid_out_actor(policy, plain_layers(policy), 50)(obs)
+    actions, _, _ = LaidOutActor(policy, plain_layers(policy), 50).act(obs)
     with th.no_grad():
         mode = policy.get_distribution(obs_as_tensor(obs, "cpu")).mode().numpy()
     np.testing.assert_allclose(actions, mode.reshape(50, *space.shape), rtol=1e-5, atol=1e-6)
@@ -45,7 +45,7 @@ def test_actions_are_drawn_from_the_policys_distribution(space, actor):
     """The mean score of the draws is 0 to within its standard error: for no other distribution is E[∇ log π] = 0."""
     policy = make_policy(space)
     obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
-    act = laid_out_actor(policy, plain_layers(policy), N_DRAWS) if actor == "laid out" else general_actor(policy)
+    act = (LaidOutActor(policy, plain_layers(policy), N_DRAWS) if actor == "laid out" else GeneralActor(policy)).act
     actions = th.as_tensor(act(obs)[0]).reshape(N_DRAWS, -1).float()
     actions = actions.flatten() if isinstance(space, spaces.Discrete) else actions
     distribution = policy.get_distribution(obs_as_tensor(obs[:1], "cpu"))
@@ -56,6 +56,15 @@ def test_actions_are_drawn_from_the_policys_distribution(space, actor):
     ])  # fmt: skip
     assert (scores.mean(0).abs() < 4 * scores.std(0) / N_DRAWS**0.5).all()
     assert (scores.std(0) > 0).all()
+
+
+@pytest.mark.parametrize("space", SPACES, ids=str)
+def test_both_give_the_same_log_probabilities(space):
+    policy = make_policy(space)
+    obs = np.random.default_rng(0).normal(size=(6, 3, 5)).astype(np.float32)
+    laid_out, general = LaidOutActor(policy, plain_layers(policy), 3), GeneralActor(policy)
+    actions = np.stack([laid_out.act(row)[0].reshape(3, -1) for row in obs])
+    np.testing.assert_allclose(laid_out.log_prob(obs, actions), general.log_prob(obs, actions), rtol=1e-5)
 
 
 def test_noise_is_that_of_its_distribution():

@@ -199,7 +199,7 @@ def test_the_buffer_is_that_of_a2c():
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("temperature", [1.0, 0.5])
 def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature, monkeypatch):
-    """With a temperature the actor is asked at each step, else laid out once; log-probabilities cost one pass more."""
+    """The laid-out actor asks the policy nothing; asked at each step, it takes one pass more for all log-probabilities."""
     model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, temperature=temperature)
     calls = {"get_distribution": 0, "predict_values": 0}
     for name in calls:
@@ -212,7 +212,7 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature
         monkeypatch.setattr(model.policy, name, counted)
     _, callback = model._setup_learn(1)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, None)
-    assert calls["get_distribution"] == 1 + (model.rollout_buffer.size() if temperature != 1 else 0)
+    assert calls["get_distribution"] == (0 if temperature == 1 else model.rollout_buffer.size() + 1)
     assert calls["predict_values"] <= (3 if baseline == "value" else 0)
 
 
