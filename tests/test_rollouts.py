@@ -199,7 +199,7 @@ def test_the_buffer_is_that_of_a2c():
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("temperature", [1.0, 0.5])
 def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature, monkeypatch):
-    """The laid-out actor asks the policy nothing; asked at each step, it takes one pass more for all log-probabilities."""
+    """The laid-out actor asks the policy nothing; the general one takes one pass more, for all log-probabilities."""
     model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, temperature=temperature)
     calls = {"get_distribution": 0, "predict_values": 0}
     for name in calls:

@@ -1,0 +1,160 @@
+"""Transitions of a vector environment through the adapter, held against those of a DummyVecEnv step by step."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Corridor
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.vec_env import GymnasiumVecEnv
+
+N_ENVS = 3
+
+
+def native(n_envs=N_ENVS, **kwargs):
+    return GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point", **kwargs))
+
+
+def synced(env_fn, mode, n_envs=N_ENVS):
+    return GymnasiumVecEnv(SyncVectorEnv([env_fn] * n_envs, autoreset_mode=mode))
+
+
+class Dicts(gym.ObservationWrapper):
+    """Observations in a dict, with a key of its own in the infos."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Dict({"obs": env.observation_space})
+
+    def observation(self, obs):
+        return {"obs": obs}
+
+    def step(self, action):
+        obs, reward, terminated, truncated, _ = super().step(action)
+        return obs, reward, terminated, truncated, {"height": 3.5}
+
+
+def assert_same(one, other):
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+@pytest.mark.parametrize("truncate", [False, True])
+@pytest.mark.parametrize("wrapper", [lambda env: env, Dicts], ids=["array", "dict"])
+def test_every_transition_is_that_of_a_dummy_vec_env(mode, truncate, wrapper):
+    """Over many episodes of different lengths: observations, rewards, dones, terminal observations and infos."""
+
+    def env_fn():
+        return wrapper(Corridor((2, 3, 5), reward=lambda t, action: t + 10.0 * action, truncate=truncate))
+
+    ours, theirs = synced(env_fn, mode), DummyVecEnv([env_fn] * N_ENVS)
+    for env in (ours, theirs):
+        env.seed(7)
+    assert_same(ours.reset(), theirs.reset())
+    rng, n_dones = np.random.default_rng(0), 0
+    for _ in range(60):
+        actions = rng.integers(2, size=N_ENVS)
+        (obs, rewards, dones, infos), (obs_, rewards_, dones_, infos_) = ours.step(actions), theirs.step(actions)
+        assert_same(obs, obs_)
+        assert_same(rewards, rewards_)
+        assert_same(dones, dones_)
+        for info, info_ in zip(infos, infos_, strict=True):
+            assert_same(info, info_)
+        n_dones += dones.sum()
+    assert n_dones > 30
+
+
+def test_every_transition_of_the_native_cart_pole_is_that_of_the_single_one():
+    """Started from the same states, over terminations and truncations; a new episode starts where the reset says."""
+    ours, theirs = native(max_episode_steps=30), make_vec_env("CartPole-v1", N_ENVS)
+    for env in theirs.envs:
+        env.unwrapped.reset()
+        env.get_wrapper_attr("_max_episode_steps")
+    ours.seed(0)
+    obs = ours.reset()
+    singles = [env.unwrapped for env in theirs.envs]
+    steps = np.zeros(N_ENVS, dtype=int)
+    ends = {"terminated": 0, "truncated": 0}
+    rng = np.random.default_rng(1)
+
+    def align(i):
+        singles[i].reset()
+        singles[i].state = ours.env.state[:, i].copy()
+        steps[i] = 0
+
+    for i in range(N_ENVS):
+        align(i)
+    for _ in range(400):
+        # Balancing one of them lives until the time limit, the others fall
+        actions = np.where(np.arange(N_ENVS) == 0, obs[:, 2] + obs[:, 3] > 0, rng.integers(2, size=N_ENVS)).astype(int)
+        obs, rewards, dones, infos = ours.step(actions)
+        steps += 1
+        for i, single in enumerate(singles):
+            expected, reward, terminated, _, _ = single.step(actions[i])
+            truncated = steps[i] >= 30
+            assert dones[i] == (terminated or truncated) and rewards[i] == reward
+            assert infos[i]["TimeLimit.truncated"] == (truncated and not terminated)
+            last = infos[i]["terminal_observation"] if dones[i] else obs[i]
+            np.testing.assert_allclose(last, expected, rtol=1e-6)
+            if dones[i]:
+                ends["terminated" if terminated else "truncated"] += 1
+                assert np.abs(obs[i]).max() <= 0.05
+                align(i)
+    assert min(ends.values()) > 5
+
+
+def test_a_late_autoreset_is_refused():
+    with pytest.raises(ValueError, match=r"autoreset_mode.*SAME_STEP"):
+        synced(Corridor, "NextStep")
+    with pytest.raises(TypeError, match="VectorEnv"):
+        GymnasiumVecEnv(gym.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize("algorithm", [REINFORCE, PPO, A2C])
+def test_algorithms_train_on_it(algorithm):
+    env = VecNormalize(VecMonitor(native(8)))
+    model = algorithm("MlpPolicy", env, n_steps=32, seed=0, device="cpu").learn(1024)
+    assert len(model.ep_info_buffer) > 5 and all(info["l"] == info["r"] for info in model.ep_info_buffer)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_same_seed_gives_the_same_parameters(seed):
+    outcomes = [
+        REINFORCE("MlpPolicy", native(4), n_steps=16, seed=seed, device="cpu").learn(256).policy.state_dict()
+        for _ in range(2)
+    ]
+    assert all((outcomes[0][name] == outcomes[1][name]).all() for name in outcomes[0])
+
+
+def test_attributes_and_methods_where_the_environment_can():
+    env = synced(Corridor, "SameStep")
+    assert env.get_attr("lengths") == [(3,)] * N_ENVS and env.get_attr("lengths", 1) == [(3,)]
+    env.set_attr("truncate", True)
+    assert env.get_attr("truncate") == [True] * N_ENVS
+    assert len(env.env_method("observe")) == N_ENVS
+    assert env.env_is_wrapped(gym.Wrapper) == [False] * N_ENVS and env.has_attr("lengths")
+    with pytest.raises(ValueError, match="indices"):
+        env.set_attr("truncate", True, indices=[0])
+    assert native().get_attr("max_episode_steps") == [500] * N_ENVS
+    with pytest.raises(AttributeError, match="at once"):
+        native().env_method("render")
+
+
+def test_pictures():
+    pytest.importorskip("pygame")
+    env = GymnasiumVecEnv(
+        SyncVectorEnv([lambda: gym.make("CartPole-v1", render_mode="rgb_array")] * 2, autoreset_mode="SameStep")
+    )
+    env.reset()
+    assert len(env.get_images()) == 2 and env.get_images()[0].ndim == 3 and env.render().ndim == 3
+    env.close()
