@@ -36,6 +36,8 @@ Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
 # Steps for which noise is drawn at once
 NOISE_STEPS = 128
+# Products beyond which NumPy's BLAS starts threads of its own, whatever number the user has set for PyTorch
+ONE_THREAD = 2**18
 
 
 class GeneralActor:
@@ -86,7 +88,7 @@ class LaidOutActor:
 
     def __init__(self, policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int):
         self.policy, self.shape = policy, (n_envs, *(policy.action_space.shape or ()))
-        self.functions = [as_function(layer) for layer in layers]
+        self.functions = [as_function(layer, n_envs) for layer in layers]
         self.sample, self.noise = make_sampler(policy), make_noise(policy, n_envs)
         self.outputs: list[Floats] = []
 
@@ -151,15 +153,19 @@ def plain_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     return layers if is_plain else None
 
 
-def as_function(layer: th.nn.Module) -> Callable[[Floats], Floats]:
+def as_function(layer: th.nn.Module, n: int) -> Callable[[Floats], Floats]:
     """
     A layer as a function of arrays of shape ``(n, n_in)``.
 
     :param layer: ``Linear``, ``Tanh`` or ``ReLU``
+    :param n: Number of rows
     """
     if isinstance(layer, th.nn.Linear):
-        weight, bias = (parameter.detach().cpu().numpy() for parameter in (layer.weight.T.contiguous(), layer.bias))
-        return lambda x: x @ weight + bias
+        weight, bias = layer.weight.detach().T.contiguous().cpu(), layer.bias.detach().cpu()
+        if n * weight.numel() > ONE_THREAD:
+            return lambda x: th.addmm(bias, th.as_tensor(x), weight).numpy()
+        weights, biases = weight.numpy(), bias.numpy()
+        return lambda x: x @ weights + biases
     return np.tanh if isinstance(layer, th.nn.Tanh) else lambda x: np.maximum(x, 0)
 
 

@@ -1,0 +1,115 @@
+"""
+How does throughput grow with the number of environments, and how far below the bare environment does it stay?
+
+CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorisation
+through ``GymnasiumVecEnv``, and both VecEnvs with no learner. Writes a CSV, and with matplotlib the picture.
+
+    python examples/benchmarks/scaling.py --output examples/benchmarks/results/scaling
+"""
+
+import argparse
+import csv
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import A2C
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.vec_env import GymnasiumVecEnv
+
+ONE_PASS = {"n_critic_updates": 1, "batch_size": 2048}
+
+
+def dummy(n_envs: int) -> VecEnv:
+    return make_vec_env("CartPole-v1", n_envs, seed=0)
+
+
+def native(n_envs: int) -> VecEnv:
+    return VecMonitor(GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point")))
+
+
+def bare(env: VecEnv, timesteps: int) -> float:
+    """Steps a second of a VecEnv with prepared actions and no learner."""
+    actions = np.random.default_rng(0).integers(2, size=(64, env.num_envs))
+    env.reset()
+    start = time.perf_counter()
+    for step in range(timesteps // env.num_envs):
+        env.step(actions[step % 64])
+    return timesteps / (time.perf_counter() - start)
+
+
+def learning(algorithm: type, env: VecEnv, timesteps: int, **kwargs: object) -> float:
+    """Steps a second of ``learn()`` with rollouts of 2048 steps, after a first rollout that is not counted."""
+    n_steps = max(8, 2048 // env.num_envs)
+    model = algorithm("MlpPolicy", env, n_steps=n_steps, seed=0, device="cpu", **kwargs).learn(1)
+    before, start = model.num_timesteps, time.perf_counter()
+    model.learn(timesteps, reset_num_timesteps=False)
+    return (model.num_timesteps - before) / (time.perf_counter() - start)
+
+
+CONTENDERS: dict[str, Callable[[int, int], float]] = {
+    "native VecEnv, no learner": lambda n, steps: bare(native(n), steps),
+    "DummyVecEnv, no learner": lambda n, steps: bare(dummy(n), steps),
+    "REINFORCE, native": lambda n, steps: learning(REINFORCE, native(n), steps, **ONE_PASS),
+    "REINFORCE": lambda n, steps: learning(REINFORCE, dummy(n), steps, **ONE_PASS),
+    "A2C": lambda n, steps: learning(A2C, dummy(n), steps),
+}
+
+
+def draw(rows: list[dict[str, object]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    for name, style in zip(CONTENDERS, ("C0:", "C1:", "C0-o", "C1-o", "C2-o"), strict=True):
+        points = [(row["n_envs"], row["steps_per_second"]) for row in rows if row["contender"] == name]
+        axes.loglog(*zip(*points, strict=True), style, label=name, markersize=4)
+    axes.set(xlabel="copies of CartPole-v1", ylabel="steps a second, one core")
+    axes.set_xscale("log", base=2)
+    axes.legend(frameon=False, fontsize="small")
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n-envs", type=int, nargs="+", default=[2**k for k in range(9)])
+    parser.add_argument("--timesteps", type=int, default=40_000)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--output", type=Path, required=True, help="path without suffix")
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    warnings.filterwarnings("ignore")
+    rows: list[dict[str, object]] = []
+    for n_envs in arguments.n_envs:
+        rates = {name: [] for name in CONTENDERS}
+        for _ in range(arguments.rounds):
+            for name, contender in CONTENDERS.items():
+                rates[name].append(contender(n_envs, arguments.timesteps))
+        rows += [
+            {"n_envs": n_envs, "contender": name, "steps_per_second": round(statistics.median(rates[name]))}
+            for name in CONTENDERS
+        ]
+        print(*rows[-len(CONTENDERS) :], sep="\n", flush=True)
+    with arguments.output.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    try:
+        draw(rows, arguments.output.with_suffix(".png"))
+    except ImportError:
+        print("No picture: matplotlib is not installed (pip install 'sb3-reinforce[plots]')")
+
+
+if __name__ == "__main__":
+    main()
