@@ -1,8 +1,8 @@
 """
 How much noise does each baseline leave in the gradient?
 
-The estimate stays the same on average, so all that a baseline can do is to lower the variance. Here every baseline
-weighs the very same episodes, and the trace of the covariance of the episodes' gradients is printed.
+A baseline is there to lower the variance of the estimate and to leave its mean alone. Here each one weighs the very
+same episodes, and the trace of the covariance of the episodes' gradients is printed.
 
     python examples/2_baselines.py
 """
@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.baselines import BASELINES, none
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, split_parameters
+from sb3_reinforce.scores import episode_gradients
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)
@@ -46,15 +46,9 @@ rollout = replace(rollout, values=values)
 
 traces = {}
 for name, baseline in BASELINES.items():
-    weights = (rollout.discounts * (rollout.returns - baseline(rollout))).float()
-    gradients = []
-    for episode in th.unique(rollout.episodes[rollout.used]):
-        steps = rollout.used & (rollout.episodes == episode)
-        actions = as_policy_actions(rollout.actions[steps], policy.action_space)
-        log_prob, _ = log_prob_and_entropy(policy, rollout.observations[steps], actions)
-        gradient = th.autograd.grad(weights[steps] @ log_prob, split_parameters(policy)[0])
-        gradients.append(th.cat([part.flatten() for part in gradient]))
-    traces[name] = th.stack(gradients).var(dim=0).sum().item()
+    weights = rollout.discounts * (rollout.returns - baseline(rollout))
+    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)])
+    traces[name] = gradients.var(dim=0).sum().item()
 
 print(f"{'baseline':16s} {'trace of the covariance':>24s} {'of none':>8s}")
 for name, trace in traces.items():

@@ -51,6 +51,18 @@ def check_integer(name: str, value: Any, low: int) -> int:
     return int(value)
 
 
+def check_flag(name: str, value: Any) -> None:
+    """
+    Check that ``value`` is True or False.
+
+    :param name: Name of the argument, for the message
+    :param value: What the user passed
+    :raises TypeError: If it is neither
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False, got {value!r} of type {type(value).__name__}")
+
+
 def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     """
     Check that ``value`` is one of some names.
@@ -105,6 +117,7 @@ class CheckedSchedule(FloatSchedule):
 
     def __call__(self, progress_remaining: float) -> float:
         value = self.value_schedule(progress_remaining)
+        value = value.item() if hasattr(value, "item") else value
         return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, above=self.above)
 
 
@@ -124,9 +137,9 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
     for key, space in parts.items():
-        if isinstance(space, spaces.Discrete) and space.start != 0:
+        if np.any(getattr(space, "start", 0)):
             where = f" under {key!r}" if key else ""
-            raise ValueError(f"A Discrete observation space{where} must start at 0, got {space}: subtract its start")
+            raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
 
 
 def check_finite(name: str, values: Any, where: tuple[int, ...] = ()) -> None:

@@ -11,8 +11,8 @@ from typing import TypeAlias
 
 import torch as th
 
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, split_parameters
-from sb3_reinforce.rollouts import Rollout, select
+from sb3_reinforce.rollouts import Rollout
+from sb3_reinforce.scores import episode_gradients
 
 Baseline: TypeAlias = Callable[[Rollout], th.Tensor]
 
@@ -73,9 +73,36 @@ def optimal(rollout: Rollout) -> th.Tensor:
     leave out the episode that b is applied to.
     """
     products, squares = score_products(rollout)
-    others = 1 - th.eye(len(products), dtype=products.dtype)
-    above, below = others @ products, others @ squares
-    return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)[rollout.episodes]
+    above, below = sum_of_others(products), sum_of_others(squares)
+    constants = th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)
+    return constants[rollout.episodes]
+
+
+def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+    """
+    ⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``.
+
+    :param rollout: The rollout
+    :return: Two tensors of shape ``(n_episodes,)``, float64; 0 for an episode without used steps
+    """
+    products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
+    numbers = th.unique(rollout.episodes[rollout.used])
+    gradients = episode_gradients(rollout, rollout.discounts * rollout.returns, rollout.discounts)
+    for number, (weighted, score) in zip(numbers, gradients, strict=True):
+        products[number] = th.stack([weighted @ score, score @ score]).cpu().double()
+    return products[:, 0], products[:, 1]
+
+
+def sum_of_others(x: th.Tensor) -> th.Tensor:
+    """
+    ``y_i = Σ_{j≠i} x_j``, as the sum before i plus the sum after i: a difference of sums would lose digits.
+
+    :param x: Shape ``(n,)``
+    :return: Shape ``(n,)``
+    """
+    zero = x.new_zeros(1)
+    before, after = th.cat([zero, x[:-1]]).cumsum(0), th.cat([x[1:], zero]).flip(0).cumsum(0).flip(0)
+    return before + after
 
 
 def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
@@ -86,28 +113,6 @@ def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
         for x in (rollout.returns * rollout.used, rollout.used.to(rollout.returns.dtype))
     )
     return totals[group], counts[group]
-
-
-def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
-    """
-    ⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, by two backward passes an episode.
-
-    :param rollout: The rollout
-    :return: Two tensors of shape ``(n_episodes,)``; 0 for an episode without used steps
-    """
-    parameters, episodes = split_parameters(rollout.policy)[0], rollout.episodes
-    products = th.zeros(2, int(episodes.max()) + 1, dtype=rollout.returns.dtype)
-    for episode in th.unique(episodes[rollout.used]):
-        steps = rollout.used & (episodes == episode)
-        actions = as_policy_actions(select(rollout.actions, steps), rollout.policy.action_space)
-        log_prob, _ = log_prob_and_entropy(rollout.policy, select(rollout.observations, steps), actions)
-        weights = rollout.discounts[steps] * th.stack([rollout.returns[steps], th.ones_like(rollout.returns[steps])])
-        weighted, score = (
-            th.cat([grad.flatten() for grad in th.autograd.grad(log_prob, parameters, weight, retain_graph=True)])
-            for weight in weights.to(log_prob)
-        )
-        products[:, episode] = th.stack([weighted @ score, score @ score]).to(products)
-    return products[0], products[1]
 
 
 BASELINES: dict[str, Baseline] = {

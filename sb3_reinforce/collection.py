@@ -4,12 +4,13 @@ How a rollout is collected: a number of steps per environment, or a quota of who
 It stands apart from ``rollouts``, which holds what was collected and the pure functions on it.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -41,7 +42,7 @@ def collect(
     model: OnPolicyAlgorithm,
     env: VecEnv,
     callback: BaseCallback,
-    buffer: RolloutBuffer,
+    rollout_buffer: RolloutBuffer,
     extent: Extent,
 ) -> Ends | None:
     """
@@ -50,58 +51,60 @@ def collect(
     :param model: The algorithm; its ``_last_obs`` and ``num_timesteps`` are kept up to date
     :param env: The environments
     :param callback: Called at each step, with the locals that the callbacks of Stable-Baselines3 read
-    :param buffer: The rollout buffer; it grows where it is too small and keeps one row per step
+    :param rollout_buffer: The rollout buffer; it grows where it is too small and keeps one row per step
     :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
     :return: How the episodes ended; None if the callback stopped the collection
     :raises ValueError: If an episode that is waited for does not end
     """
-    policy, actor, step = model.policy, make_actor(model.policy, env.num_envs), 0
+    policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs), 0
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
     deadline = extent.max_episode_steps
-    while step < extent.n_steps and owed.any():
-        if step == deadline:
+    while n_steps < extent.n_steps and owed.any():
+        if n_steps == deadline:
             raise ValueError(
                 f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole "
                 "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
             )
-        if step == buffer.buffer_size:
-            resize(buffer, 2 * step)
-        if model.use_sde and model.sde_sample_freq > 0 and step % model.sde_sample_freq == 0:
+        if n_steps == rollout_buffer.buffer_size:
+            resize(rollout_buffer, 2 * n_steps)
+        if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
-        actions, values, log_prob = actor.act(model._last_obs)
-        write(buffer.observations, step, model._last_obs)
-        write(buffer.actions, step, actions)
-        write(buffer.episode_starts, step, model._last_episode_starts)
-        if values is not None and log_prob is not None:
-            write(buffer.values, step, values)
-            write(buffer.log_probs, step, log_prob)
+        actions, values, log_probs = actor.act(model._last_obs)
+        write(rollout_buffer.observations, n_steps, model._last_obs)
+        write(rollout_buffer.actions, n_steps, actions)
+        write(rollout_buffer.episode_starts, n_steps, model._last_episode_starts)
+        if values is not None and log_probs is not None:
+            write(rollout_buffer.values, n_steps, values)
+            write(rollout_buffer.log_probs, n_steps, log_probs)
 
         clipped_actions = as_env_actions(policy, actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
-        write(buffer.rewards, step, rewards)
-        all_dones.append(dones)
         model.num_timesteps += env.num_envs
         model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
 
         callback.update_locals(locals())
         if not callback.on_step():
             return None
+        # After the callback, which may have changed the rewards in place; some VecEnvs reuse the array of the dones
+        write(rollout_buffer.rewards, n_steps, rewards)
+        all_dones.append(dones.astype(bool))
         if dones.any():
-            wanted = np.flatnonzero(dones & (owed > 0))
+            wanted = np.flatnonzero(all_dones[-1] & (owed > 0))
             model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
             for i in wanted:
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    terminal_obs[step, int(i)] = infos[i]["terminal_observation"]
+                    terminal_obs[n_steps, int(i)] = infos[i]["terminal_observation"]
             owed[wanted] -= 1
-            begun[wanted] = step + 1
+            begun[wanted] = n_steps + 1
             deadline = extent.max_episode_steps + min(begun[owed > 0], default=0)
-        buffer.pos = step = step + 1
-    resize(buffer, step)
-    buffer.full = True
-    if log_prob is None:
-        buffer.log_probs = actor.log_prob(buffer.observations, buffer.actions).reshape(buffer.rewards.shape)
+        rollout_buffer.pos = n_steps = n_steps + 1
+    resize(rollout_buffer, n_steps)
+    rollout_buffer.full = True
+    if log_probs is None:
+        shape = rollout_buffer.rewards.shape
+        rollout_buffer.log_probs = actor.log_prob(rollout_buffer.observations, rollout_buffer.actions).reshape(shape)
     return Ends(np.stack(all_dones), terminal_obs)
 
 
@@ -165,6 +168,32 @@ def resize(buffer: RolloutBuffer, n_steps: int) -> None:
         for name in ROWS:
             setattr(buffer, name, resized(getattr(buffer, name)))
         buffer.buffer_size = n_steps
+
+
+def by_step(buffer: RolloutBuffer, rows: np.ndarray) -> np.ndarray:
+    """
+    Rows of a rollout buffer step by step, also after ``get`` has put those of each environment one after the other.
+
+    :param buffer: The rollout buffer
+    :param rows: Its ``advantages`` or ``returns``
+    :return: Shape ``(n_steps, n_envs)``
+    """
+    return np.ascontiguousarray(rows.reshape(buffer.n_envs, -1).T) if buffer.generator_ready else rows
+
+
+def warn_of_own_methods(buffer: RolloutBuffer) -> None:
+    """
+    Warn where a user's rollout buffer would not be asked.
+
+    :param buffer: The rollout buffer
+    """
+    for name in ("add", "compute_returns_and_advantage"):
+        if getattr(type(buffer), name) not in (getattr(RolloutBuffer, name), getattr(DictRolloutBuffer, name)):
+            warnings.warn(
+                f"rollout_buffer_class={type(buffer).__name__} overrides {name}, which is not called: the buffer's "
+                "arrays are written in place. For other weights use your own baseline, or a callback's on_rollout_end",
+                stacklevel=2,
+            )
 
 
 def check_data(buffer: RolloutBuffer, last_obs: Any, terminal_obs: dict[tuple[int, int], Any]) -> None:

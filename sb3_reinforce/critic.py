@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from sb3_reinforce import optimization
 from sb3_reinforce.collection import Ends
-from sb3_reinforce.policies import overrides
+from sb3_reinforce.policies import Parameters, overrides
 from sb3_reinforce.returns import Floats
 from sb3_reinforce.rollouts import flatten, take
 
@@ -69,6 +69,7 @@ def stack(observations: list[Any]) -> Any:
 def fit_critic(
     policy: ActorCriticPolicy,
     optimizer: th.optim.Optimizer,
+    parameters: Parameters,
     obs: PyTorchObs,
     returns: th.Tensor,
     n_updates: int,
@@ -78,17 +79,19 @@ def fit_critic(
     """
     Lower the mean of ``(G_t − V(s_t))²`` over the rollout, in minibatches drawn without replacement.
 
-    :param policy: The policy; only the parameters that ``optimizer`` holds are changed
+    :param policy: The policy
     :param optimizer: The critic's optimizer
+    :param parameters: The parameters to change
     :param obs: ``n`` observations
     :param returns: G_t, shape ``(n,)``
     :param n_updates: Passes over the rollout
     :param batch_size: Size of a minibatch; the last one of a pass may be smaller
     :param max_grad_norm: Bound on the norm of a step's gradient, None for no bound
-    :return: The mean of the minibatches' losses
+    :return: The mean of the minibatches' losses; 0 for a critic without parameters of its own
     :raises ValueError: If a gradient is not finite; the critic keeps the parameters of the step before
     """
-    parameters = optimizer.param_groups[0]["params"]
+    if not parameters:
+        return 0.0
     losses = []
     for _ in range(n_updates):
         for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]

@@ -4,14 +4,13 @@ What REINFORCE asks of an actor-critic policy of Stable-Baselines3, or of a user
 A method that the user has overridden is called as it is; where nothing is overridden, only the actor is evaluated.
 """
 
+import math
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import obs_as_tensor
 
 Parameters: TypeAlias = list[th.nn.Parameter]
 
@@ -55,49 +54,79 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
     return log_prob, -log_prob if entropy is None else entropy
 
 
-def split_parameters(policy: ActorCriticPolicy) -> tuple[Parameters, Parameters, Parameters]:
+def split_parameters(
+    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
+) -> tuple[Parameters, Parameters, Parameters]:
     """
-    Sort the trainable parameters by what depends on them, read from the graph of one evaluation, not from their names.
+    Sort the trainable parameters by what depends on them, read from the graph and not from their names.
 
     :param policy: The policy
-    :return: The parameters that log π depends on, those that only V depends on, and those that both depend on (the
-        shared features extractor); the third list is part of the first
+    :param obs: ``n`` observations
+    :param actions: As ``as_policy_actions`` gives them
+    :return: The parameters that log π depends on, those that only V depends on, and those that both depend on (a shared
+        features extractor); the third list is part of the first
     """
-    obs = obs_as_tensor(_zeros(policy.observation_space), policy.device)
-    action_dim = int(np.prod(_zeros(policy.action_space).shape))
-    actions = as_policy_actions(th.zeros(1, action_dim, device=policy.device), policy.action_space)
     parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
-    policy.set_training_mode(False)
-    in_actor, in_critic = (
-        [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
-        for output in (log_prob_and_entropy(policy, obs, actions)[0], policy.predict_values(obs))
-    )
-    sorted_parameters = list(zip(parameters, in_actor, in_critic, strict=True))
+    in_actor = reached(log_prob_and_entropy(policy, obs, actions)[0], parameters)
+    in_critic = reached(policy.predict_values(obs), parameters)
+    table = list(zip(parameters, in_actor, in_critic, strict=True))
     return (
-        [parameter for parameter, actor, _ in sorted_parameters if actor],
-        [parameter for parameter, actor, critic in sorted_parameters if critic and not actor],
-        [parameter for parameter, actor, critic in sorted_parameters if critic and actor],
+        [parameter for parameter, actor, _ in table if actor],
+        [parameter for parameter, actor, critic in table if critic and not actor],
+        [parameter for parameter, actor, critic in table if critic and actor],
     )
 
 
-def _zeros(space: spaces.Space[Any]) -> Any:
-    """An all-zero batch of one element of the space."""
-    if isinstance(space, spaces.Dict):
-        return {key: _zeros(part) for key, part in space.spaces.items()}
-    return np.zeros((1, *(space.shape or ())), dtype=space.dtype)
-
-
-def divide_logits(policy: ActorCriticPolicy, temperature: th.Tensor) -> None:
+def reached(output: th.Tensor, parameters: Parameters) -> list[bool]:
     """
-    From now on ``π(a|s) ∝ exp(logits(s, a) / τ)``, wherever the policy is evaluated.
+    Which parameters an output depends on.
+
+    :param output: Any tensor
+    :param parameters: The parameters
+    """
+    if not output.requires_grad:
+        return [False] * len(parameters)
+    return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
+
+
+class DivideLogits:
+    """
+    ``π(a|s) ∝ exp(logits(s, a) / τ)``: a forward hook for the layer that makes the logits.
+
+    :param temperature: τ, a tensor without dimensions
+    """
+
+    def __init__(self, temperature: th.Tensor):
+        self.temperature = temperature
+
+    def __call__(self, module: th.nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
+        """
+        Divide the logits.
+
+        :param module: The layer
+        :param inputs: Its inputs
+        :param logits: Its output
+        """
+        return logits / self.temperature
+
+
+def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
+    """
+    From now on the policy acts and is evaluated at a temperature. ``policy.save`` does not keep it, a model's does.
 
     :param policy: A policy over discrete actions
-    :param temperature: τ, a tensor without dimensions, read at each evaluation
-    :raises ValueError: If the policy has no ``action_net``
+    :param temperature: τ
+    :raises ValueError: If τ is not 1 and the policy has no ``action_net``
     """
-    if not hasattr(policy, "action_net"):
+    layer = getattr(policy, "action_net", None)
+    if layer is None and temperature != 1:
         raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
-    policy.action_net.register_forward_hook(lambda module, inputs, logits: logits / temperature)
+    hooks = [hook for hook in layer._forward_hooks.values() if isinstance(hook, DivideLogits)] if layer else []
+    if temperature != 1 and not hooks and layer:
+        hooks = [DivideLogits(th.ones((), device=policy.device))]
+        layer.register_forward_hook(hooks[0])
+    for hook in hooks:
+        hook.temperature.fill_(temperature)
 
 
 @th.no_grad()
@@ -107,9 +136,9 @@ def floor_std(policy: ActorCriticPolicy, min_std: float) -> None:
 
     :param policy: A policy with Gaussian actions
     :param min_std: The floor, in units of the (unsquashed) action; 0 is no floor
-    :raises ValueError: If the policy has no ``log_std``
+    :raises ValueError: If there is a floor and the policy has no ``log_std``
     """
     if min_std > 0:
         if not hasattr(policy, "log_std"):
             raise ValueError(f"min_std needs a policy with a log_std, and {type(policy).__name__} has none")
-        policy.log_std.clamp_(min=float(np.log(min_std)))
+        policy.log_std.clamp_(min=math.log(min_std))

@@ -22,13 +22,14 @@ from torch.nn import functional as F
 from sb3_reinforce import optimization
 from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
 from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.collection import check_data, collect, shift_to_start
+from sb3_reinforce.collection import by_step, check_data, collect, shift_to_start, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
 from sb3_reinforce.policies import (
+    Parameters,
     as_policy_actions,
-    divide_logits,
     floor_std,
     log_prob_and_entropy,
+    set_temperature,
     split_parameters,
 )
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, select
@@ -199,11 +200,15 @@ class REINFORCE(OnPolicyAlgorithm):
         return Weighing(baseline, self.gamma, self.gae_lambda, self.reward_to_go, self.discount_scores)
 
     def _setup_lr_schedule(self) -> None:
-        critic_rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
         self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate)
-        self.critic_lr_schedule = CheckedSchedule("critic_learning_rate", critic_rate)
-        self.ent_coef_schedule = CheckedSchedule("ent_coef", self.ent_coef)
-        self.temperature_schedule = CheckedSchedule("temperature", self.temperature, above=True)
+
+    def _scheduled(self, name: str, above: bool = False) -> float:
+        """The present value of an argument that may be a schedule, and that a callback may have set anew."""
+        return CheckedSchedule(name, getattr(self, name), above=above)(self._current_progress_remaining)
+
+    def _critic_rate(self) -> float:
+        name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
+        return self._scheduled(name)
 
     def _setup_model(self) -> None:
         check_reinforce(self)
@@ -211,23 +216,37 @@ class REINFORCE(OnPolicyAlgorithm):
         n_steps, self.n_steps = self.n_steps, self.n_steps or 1
         super()._setup_model()
         self.n_steps = n_steps
+        warn_of_own_methods(self.rollout_buffer)
+        optimization.fuse(self.policy.optimizer)
+        self._make_critic_optimizer()
+        self._sorted_parameters: tuple[Any, ...] = ()
+        self._scheduled("ent_coef")
+        self._apply_temperature_and_floor()
 
-        self._actor_parameters, critic_parameters, self._shared_parameters = split_parameters(self.policy)
+    def _make_critic_optimizer(self) -> None:
+        """Over all parameters, of which it is only ever given the gradients of the critic's own."""
         self.critic_optimizer = self.policy.optimizer_class(
-            critic_parameters,
-            lr=self.critic_lr_schedule(1),  # type: ignore[call-arg]
+            self.policy.parameters(),
+            lr=self._critic_rate(),  # type: ignore[call-arg]
             **self.policy.optimizer_kwargs,
         )
-        for optimizer in (self.policy.optimizer, self.critic_optimizer):
-            optimization.fuse(optimizer)
-        self._temperature = th.ones((), device=self.device)
-        self._update_temperature()
-        if self.temperature != 1:
-            divide_logits(self.policy, self._temperature)
-        floor_std(self.policy, self.min_std)
+        optimization.fuse(self.critic_optimizer)
 
-    def _update_temperature(self) -> None:
-        self._temperature.fill_(self.temperature_schedule(self._current_progress_remaining))
+    def _sort_parameters(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[Parameters, Parameters, Parameters]:
+        """What log π depends on, what only V depends on, and what both do: found anew where the policy has changed."""
+        trainable = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
+        if self._sorted_parameters[:1] != (trainable,):
+            held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
+            if not held >= {number for number, _ in trainable}:
+                self._make_critic_optimizer()
+            self.policy.set_training_mode(False)
+            self._sorted_parameters = (trainable, split_parameters(self.policy, obs, actions))
+        groups: tuple[Parameters, Parameters, Parameters] = self._sorted_parameters[1]
+        return groups
+
+    def _apply_temperature_and_floor(self) -> None:
+        set_temperature(self.policy, self._scheduled("temperature", above=True))
+        floor_std(self.policy, self.min_std)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # A last rollout that overshoots total_timesteps must not train at a negative rate
@@ -250,7 +269,7 @@ class REINFORCE(OnPolicyAlgorithm):
             are reset before they are used again
         """
         self.policy.set_training_mode(False)
-        self._update_temperature()
+        self._apply_temperature_and_floor()
         rollout_buffer.reset()
         if n_rollout_steps is None and not np.all(self._last_episode_starts):
             self._last_obs = env.reset()  # type: ignore[assignment]
@@ -295,28 +314,32 @@ class REINFORCE(OnPolicyAlgorithm):
 
         :raises ValueError: If a gradient is not finite; the parameters are those before that step
         """
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        rollout = cast(Rollout, self._rollout)
+        rollout, buffer = cast(Rollout, self._rollout), self.rollout_buffer
         used = rollout.used
+        ent_coef, critic_rate = self._scheduled("ent_coef"), self._critic_rate()
         obs = select(rollout.observations, used)
         actions = as_policy_actions(select(rollout.actions, used), self.action_space)
-        targets = select(th.as_tensor(self.rollout_buffer.returns, device=self.device), used)
-        weights = select(th.as_tensor(self.rollout_buffer.advantages, device=self.device), used)
+        targets = select(th.as_tensor(by_step(buffer, buffer.returns), device=self.device), used)
+        weights = select(th.as_tensor(by_step(buffer, buffer.advantages), device=self.device), used)
         if self.normalize_advantage:
             weights = normalized(weights)
         weights = weights * select(rollout.discounts, used).to(weights)
+        actor: Parameters = [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
+        critic: Parameters = []
+        shared: Parameters = []
+        if self.has_critic:
+            actor, critic, shared = self._sort_parameters(obs, actions)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
 
         log_prob, entropy = log_prob_and_entropy(self.policy, obs, actions)
         policy_loss = -(weights * log_prob).sum() / self._denominator(rollout)
         entropy_loss = -entropy.sum() / self._denominator(rollout)
-        loss = policy_loss + self.ent_coef_schedule(self._current_progress_remaining) * entropy_loss
-        if self.has_critic and self._shared_parameters:
+        loss = policy_loss + ent_coef * entropy_loss
+        if shared:
             loss = loss + self.vf_coef * F.mse_loss(self.policy.predict_values(obs).flatten(), targets)
-        gradient = th.autograd.grad(loss, self._actor_parameters, allow_unused=True)
-        grad_norm = optimization.step(
-            self.policy.optimizer, self._actor_parameters, gradient, self.max_grad_norm, "policy"
-        )
+        gradient = th.autograd.grad(loss, actor, allow_unused=True)
+        grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
         floor_std(self.policy, self.min_std)
         self._n_updates += 1
 
@@ -327,16 +350,22 @@ class REINFORCE(OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:
-            self._train_critic(obs, targets, select(cast(th.Tensor, rollout.values), used))
-
-    def _train_critic(self, obs: PyTorchObs, targets: th.Tensor, values: th.Tensor) -> None:
-        """Fit V(s_t) to the returns, and log how much of their variance it explained before."""
-        update_learning_rate(self.critic_optimizer, self.critic_lr_schedule(self._current_progress_remaining))
-        value_loss = fit_critic(
-            self.policy, self.critic_optimizer, obs, targets, self.n_critic_updates, self.batch_size, self.max_grad_norm
-        )
-        self.logger.record("train/value_loss", value_loss)
-        self.logger.record("train/explained_variance", explained_variance(values.numpy(), targets.cpu().numpy()))
+            # Passes that moved the statistics of a shared extractor would be a second step of the policy
+            self.policy.set_training_mode(not shared)
+            update_learning_rate(self.critic_optimizer, critic_rate)
+            value_loss = fit_critic(
+                self.policy,
+                self.critic_optimizer,
+                critic,
+                obs,
+                targets,
+                self.n_critic_updates,
+                self.batch_size,
+                self.max_grad_norm,
+            )
+            self.logger.record("train/value_loss", value_loss)
+            values = select(cast(th.Tensor, rollout.values), used).numpy()
+            self.logger.record("train/explained_variance", explained_variance(values, targets.cpu().numpy()))
 
     def _denominator(self, rollout: Rollout) -> int:
         """The constant ``n_steps * n_envs`` for fixed rollouts, else by ``normalize_by``."""
@@ -396,8 +425,7 @@ class REINFORCE(OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        mine = ["_actor_parameters", "_shared_parameters", "_rollout", "_temperature"]
-        return [*super()._excluded_save_params(), *mine]
+        return [*super()._excluded_save_params(), "_sorted_parameters", "_rollout"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

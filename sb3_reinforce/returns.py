@@ -53,20 +53,18 @@ def lambda_return(
     return discounted_sum(rewards + gamma * (1 - gae_lambda * goes_on) * next_values, gamma * gae_lambda * goes_on)
 
 
-def reward_to_go(rewards: Floats, dones: Bools, gamma: float, next_values: Floats | float = 0.0) -> Floats:
+def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
     """
-    ``G_t = Σ_{k≥t} γ^{k−t} r_k`` over the rest of the episode, plus ``γ^{T−t} V(s_T)`` where it is cut before step T.
+    ``G_t = Σ_{k≥t} γ^{k−t} r_k`` over the rest of the episode, or of the rollout.
 
-    It is the λ-return at λ = 1. Source: Sutton and Barto (2018), equation 3.8.
+    It is the λ-return at λ = 1 without a critic. Source: Sutton and Barto (2018), equation 3.8.
 
     :param rewards: Shape ``(n_steps, n_envs)``
     :param dones: Shape ``(n_steps, n_envs)``
     :param gamma: Discount factor γ
-    :param next_values: Shape ``(n_steps, n_envs)``; counts only where an episode or the rollout ends. By default
-        nothing is known to follow
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    return lambda_return(rewards, dones, next_values, gamma, gae_lambda=1.0)
+    return lambda_return(rewards, dones, 0.0, gamma, gae_lambda=1.0)
 
 
 def generalized_advantage(

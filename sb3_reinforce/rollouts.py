@@ -22,6 +22,8 @@ class Rollout:
     """
     What a baseline may look at: a rollout with its returns. Every tensor begins with ``(n_steps, n_envs)``.
 
+    Observations and actions are on the policy's device, all else on the CPU.
+
     :param observations: s_t, a tensor or a dict of tensors
     :param actions: a_t as the policy drew them, shape ``(n_steps, n_envs, action_dim)``
     :param rewards: r_t, float64

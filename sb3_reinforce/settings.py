@@ -4,7 +4,7 @@ from typing import Any
 
 from gymnasium import spaces
 
-from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.arguments import check_choice, check_flag, check_function, check_integer, check_number
 from sb3_reinforce.baselines import BASELINES
 
 DEFAULT_N_STEPS = 32
@@ -34,8 +34,13 @@ def check_reinforce(model: Any) -> None:
         check_integer("n_episodes", model.n_episodes, 2 if model.baseline in ("leave_one_out", "optimal") else 1)
     else:
         check_integer("n_steps", model.n_steps, 1)
-    for name, low in (("n_critic_updates", 1), ("batch_size", 1), ("max_episode_steps", 1), ("sde_sample_freq", -1)):
+    for name, low in {"n_critic_updates": 1, "batch_size": 1, "max_episode_steps": 1, "sde_sample_freq": -1}.items():
         check_integer(name, getattr(model, name), low)
+    check_integer("stats_window_size", model._stats_window_size, 1)
+    if model.seed is not None:
+        check_integer("seed", model.seed, 0)
+    for name in ("reward_to_go", "discount_scores", "normalize_advantage", "use_sde"):
+        check_flag(name, getattr(model, name))
     check_number("gamma", model.gamma, 0, 1)
     check_number("gae_lambda", model.gae_lambda, 0, 1)
     check_number("vf_coef", model.vf_coef, 0)

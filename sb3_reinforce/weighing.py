@@ -117,7 +117,7 @@ def weigh(
         dones=th.as_tensor(dones),
         timesteps=th.as_tensor(timesteps),
         used=th.as_tensor(used),
-        returns=th.as_tensor(returns),
+        returns=th.tensor(returns),
         discounts=th.as_tensor(gamma ** (timesteps * (weighing.discount_scores and weighing.reward_to_go))),
         values=th.as_tensor(buffer.values).double() if weighing.has_critic else None,
         policy=policy,
@@ -135,7 +135,7 @@ def normalized(weights: th.Tensor) -> th.Tensor:
     :param weights: Shape ``(n,)``
     :return: Shape ``(n,)``
     """
-    if len(weights) < 2 or weights.std() == 0:
+    if len(weights) < 2 or weights.max() == weights.min():
         return weights
     return (weights - weights.mean()) / (weights.std() + 1e-8)
 
@@ -179,7 +179,7 @@ def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
             f"baseline must return a tensor of shape (n_steps, n_envs) = {tuple(rollout.returns.shape)}, got "
             f"{tuple(baseline.shape)}"
         )
-    values = baseline.detach().double().cpu().numpy()
+    values = baseline.detach().cpu().double().numpy()
     wrong = np.argwhere(~np.isfinite(values) & rollout.used.numpy())
     if len(wrong):
         step, env = wrong[0]

@@ -1,5 +1,8 @@
 """What works with A2C works here: spaces, policies, environments, callbacks, logs, saving."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from stable_baselines3 import A2C
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CheckpointCallback,
@@ -19,11 +23,12 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies import split_parameters
 
 MODES = [{"n_steps": 8}, {"n_episodes": 3, "baseline": "leave_one_out"}]
 TINY = {"net_arch": [8]}
@@ -46,7 +51,7 @@ class AnySpace(gym.Env):
     def step(self, action):
         assert self.action_space.contains(action), action
         self.t += 1
-        return self.observation_space.sample(), 1.0, False, self.t == 5, {}
+        return self.observation_space.sample(), self.np_random.random(), False, self.t == 5, {}
 
 
 IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
@@ -74,9 +79,9 @@ ACTIONS = {
 
 
 def assert_trains(model):
-    before = [parameter.clone() for parameter in model._actor_parameters]
+    before = model.policy.action_net.weight.clone()
     model.learn(60)
-    assert any(not th.equal(old, new) for old, new in zip(before, model._actor_parameters, strict=True))
+    assert not th.equal(before, model.policy.action_net.weight)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
@@ -162,8 +167,18 @@ class NeverTwice(BaseCallback):
         self.rollout_ends += 1
 
     def _on_step(self):
-        for name in ("new_obs", "rewards", "dones", "infos", "actions", "self", "total_timesteps", "tb_log_name"):
-            assert name in self.locals
+        of_steps = {
+            "new_obs",
+            "rewards",
+            "dones",
+            "infos",
+            "actions",
+            "clipped_actions",
+            "values",
+            "log_probs",
+            "n_steps",
+        }
+        assert self.locals.keys() >= of_steps | {"env", "rollout_buffer", "self", "total_timesteps", "tb_log_name"}
         return np.bool_(self.n_calls < self.at)
 
 
@@ -321,7 +336,8 @@ def test_schedules_are_followed():
             return True
 
         def _on_rollout_start(self):
-            seen.append(model._temperature.item())
+            (hook,) = model.policy.action_net._forward_hooks.values()
+            seen.append(hook.temperature.item())
 
     model.learn(64, callback=Watch())
     assert seen == pytest.approx([2.0, 1.75, 1.5, 1.25])
@@ -364,16 +380,35 @@ def test_min_std_is_a_floor():
     assert min(stds) >= 0.6 - 1e-6 and model.logger.name_to_value["train/std"] >= 0.6 - 1e-6
 
 
-def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone():
+@pytest.mark.parametrize("name", ["flat", "image", "dict"])
+def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(name):
     """One policy step per rollout: at policy rate 0 nothing that the actor depends on moves, and the critic does."""
-    for space, policy in (OBSERVATIONS["flat"], OBSERVATIONS["image"], OBSERVATIONS["dict"]):
-        model = REINFORCE(policy, AnySpace(space), n_steps=10, learning_rate=0.0, critic_learning_rate=1e-3)
-        actor, critic, shared = split_parameters(model.policy)
-        assert len(actor) + len(critic) == len(list(model.policy.parameters()))
-        assert bool(shared) == (policy != "MlpPolicy")
-        before = [parameter.clone() for parameter in actor], [parameter.clone() for parameter in critic]
-        model.learn(20)
-        assert all(map(th.equal, before[0], actor)) and not any(map(th.equal, before[1], critic))
+    space, policy = OBSERVATIONS[name]
+    model = REINFORCE(policy, AnySpace(space), n_steps=10, learning_rate=0.0, critic_learning_rate=1e-3)
+    before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
+    model.learn(20)
+    moved = {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
+    assert moved == {name for name in before if "value_net" in name}
+
+
+class BatchNormExtractor(FlattenExtractor):
+    """An extractor that actor and critic share, with statistics that move when it is evaluated in training mode."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.batch_norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.batch_norm(super().forward(observations))
+
+
+def test_the_critics_passes_leave_the_statistics_of_a_shared_extractor_alone():
+    statistics = []
+    for n_critic_updates in (1, 20):
+        kwargs = {"features_extractor_class": BatchNormExtractor}
+        model = REINFORCE("MlpPolicy", "CartPole-v1", n_critic_updates=n_critic_updates, seed=0, policy_kwargs=kwargs)
+        statistics.append(model.learn(32).policy.features_extractor.batch_norm.running_mean.clone())
+    assert th.equal(*statistics) and statistics[0].abs().sum() > 0
 
 
 def test_the_policy_step_trains_a_shared_extractor_for_the_critic_too():
@@ -385,6 +420,156 @@ def test_the_policy_step_trains_a_shared_extractor_for_the_critic_too():
         before = model.policy.features_extractor.linear[0].weight.clone()
         model.learn(10)
         assert th.equal(before, model.policy.features_extractor.linear[0].weight) == (vf_coef == 0)
+
+
+def test_a_policy_that_is_replaced_or_frozen_after_construction():
+    """As in A2C: what is trained is read from the policy at each step."""
+    for kwargs in ({}, {"baseline": "none", "n_episodes": 2}):
+        model, other = (REINFORCE("MlpPolicy", "CartPole-v1", **kwargs) for _ in range(2))
+        model.policy = other.policy
+        before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
+        model.learn(64)
+        moved = {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
+        assert moved == {name for name in before if not kwargs or "value_net" not in name}
+
+        frozen = [
+            *model.policy.mlp_extractor.policy_net.parameters(),
+            *model.policy.mlp_extractor.value_net.parameters(),
+        ]
+        for parameter in frozen:
+            parameter.requires_grad_(False)
+        before = [parameter.clone() for parameter in frozen], model.policy.action_net.weight.clone()
+        model.learn(64)
+        assert all(map(th.equal, before[0], frozen)) and not th.equal(before[1], model.policy.action_net.weight)
+
+
+class ConstantCritic(ActorCriticPolicy):
+    """Thinks that nothing is worth anything."""
+
+    def predict_values(self, obs):
+        return th.zeros(len(obs), 1)
+
+
+def test_a_critic_without_parameters():
+    model = REINFORCE(ConstantCritic, "CartPole-v1", n_steps=16).learn(64)
+    assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
+
+
+def test_what_a_callback_sets_is_used():
+    class Set(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            self.model.ent_coef, self.model.temperature, self.model.gamma = 1e6, 3.0, 0.5
+
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=16, max_grad_norm=None).learn(32, callback=Set())
+    assert model.logger.name_to_value["train/grad_norm"] > 100
+    assert next(iter(model.policy.action_net._forward_hooks.values())).temperature == 3
+
+
+@pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 5}])
+def test_a_callback_may_read_the_buffer_in_minibatches_or_change_its_advantages(mode):
+    """``get`` puts the rows of each environment one after the other; training is the same as without it."""
+
+    class Read(BaseCallback):
+        def __init__(self, read, factor=1.0):
+            super().__init__()
+            self.read, self.factor = read, factor
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            if self.read:
+                next(self.model.rollout_buffer.get(batch_size=3))
+            self.model.rollout_buffer.advantages *= self.factor
+
+    outcomes = []
+    for callback in (Read(False), Read(True), Read(True, factor=0.0)):
+        env = make_vec_env("CartPole-v1", 3, seed=0)
+        model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", **mode).learn(20, callback=callback)
+        outcomes.append(model.policy.action_net.weight.clone())
+    assert th.equal(outcomes[0], outcomes[1]) and not th.equal(outcomes[0], outcomes[2])
+
+
+def test_a_callback_may_shape_the_rewards_in_place():
+    class Shape(BaseCallback):
+        def _on_step(self):
+            self.locals["rewards"] *= 5
+            return True
+
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=16).learn(16, callback=Shape())
+    assert (model.rollout_buffer.rewards == 5).all()
+
+
+class Reused(VecEnvWrapper):
+    """Hands out the same array of dones at each step, as numbers."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.dones = getattr(self, "dones", np.zeros(self.num_envs, dtype=np.uint8))
+        self.dones[:] = dones
+        return obs, rewards, self.dones, infos
+
+
+def test_a_vec_env_may_reuse_its_array_of_dones():
+    env = Reused(make_vec_env(lambda: Corridor((3,)), 2))
+    model = REINFORCE("MlpPolicy", env, n_steps=9).learn(18)
+    assert model._rollout.dones[:, 0].tolist() == [False, False, True] * 3
+
+
+class OwnAdd(RolloutBuffer):
+    def add(self, *args, **kwargs):
+        return super().add(*args, **kwargs)
+
+
+def test_rollout_buffer_classes():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", rollout_buffer_class=RolloutBuffer, rollout_buffer_kwargs={})
+    assert type(model.rollout_buffer) is RolloutBuffer
+    with pytest.warns(UserWarning, match=r"OwnAdd overrides add"):
+        REINFORCE("MlpPolicy", "CartPole-v1", rollout_buffer_class=OwnAdd)
+    with pytest.raises(TypeError, match="wrong_keyword"):
+        REINFORCE("MlpPolicy", "CartPole-v1", rollout_buffer_kwargs={"wrong_keyword": 1})
+
+
+def test_min_std_holds_from_the_first_step_after_a_load(tmp_path):
+    REINFORCE("MlpPolicy", "Pendulum-v1", policy_kwargs={"log_std_init": -3.0}).save(tmp_path / "model")
+    model = REINFORCE.load(tmp_path / "model", env=gym.make("Pendulum-v1"), min_std=0.5, learning_rate=0.0)
+    assert model.learn(32).policy.log_std.exp().item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("sde_sample_freq", "expected"), [(-1, 1), (4, 3)])
+def test_the_noise_of_gsde_is_drawn_when_it_should_be(sde_sample_freq, expected, monkeypatch):
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, sde_sample_freq=sde_sample_freq, n_steps=8)
+    calls = []
+    original = model.policy.reset_noise
+    monkeypatch.setattr(model.policy, "reset_noise", lambda *args: calls.append(args) or original(*args))
+    model.learn(8)
+    assert calls == [(1,)] * expected
+
+
+def test_a_squashed_action_is_unscaled_for_the_environment():
+    sent = []
+
+    class Recorder(gym.ActionWrapper):
+        def action(self, action):
+            sent.append(action)
+            return action
+
+    kwargs = {"squash_output": True, "log_std_init": 1.0}
+    model = REINFORCE("MlpPolicy", Recorder(gym.make("Pendulum-v1")), n_steps=8, use_sde=True, policy_kwargs=kwargs)
+    model.learn(8)
+    np.testing.assert_allclose(np.ravel(sent), 2 * model.rollout_buffer.actions.ravel(), rtol=1e-6)
+
+
+def test_the_policy_can_be_pickled_and_copied():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", temperature=0.5)
+    for policy in (copy.deepcopy(model.policy), pickle.loads(pickle.dumps(model.policy))):
+        assert all(map(th.equal, policy.parameters(), model.policy.parameters()))
 
 
 def test_exactly_one_policy_step_per_rollout():

@@ -33,6 +33,11 @@ NAN, INF = float("nan"), float("inf")
         "max_episode_steps": (0, -1, NAN),
         "normalize_by": ("batch", 3),
         "sde_sample_freq": (-2, 1.5),
+        "stats_window_size": (0, -1, NAN),
+        "seed": (-1, 1.5, "x"),
+        "reward_to_go": ("no", 1),
+        "discount_scores": ("no", None),
+        "normalize_advantage": ("no",),
     }.items(),
 )
 def test_an_argument_out_of_its_range_is_named_with_its_value(name, values):
@@ -112,11 +117,13 @@ def test_an_action_space_that_no_policy_can_act_in(action_space):
 
 
 def test_a_discrete_observation_must_start_at_zero():
-    class Shifted(Corridor):
-        observation_space = property(lambda self: spaces.Discrete(4, start=2), lambda self, space: None)
+    for shifted in (spaces.Discrete(4, start=2), spaces.MultiDiscrete([2, 2], start=[0, 1])):
 
-    with pytest.raises(ValueError, match="start at 0"):
-        REINFORCE("MlpPolicy", Shifted())
+        class Shifted(Corridor):
+            observation_space = property(lambda self, space=shifted: space, lambda self, space: None)
+
+        with pytest.raises(ValueError, match="start at 0"):
+            REINFORCE("MlpPolicy", Shifted())
 
 
 @pytest.mark.parametrize(
@@ -264,10 +271,10 @@ def test_an_exception_of_the_environment_passes_and_leaves_the_last_parameters(t
 
 
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
-    from sb3_reinforce.policies import divide_logits, floor_std
+    from sb3_reinforce.policies import floor_std, set_temperature
 
     with pytest.raises(ValueError, match="action_net"):
-        divide_logits(th.nn.Linear(1, 1), th.ones(()))
+        set_temperature(th.nn.Linear(1, 1), 0.5)
     with pytest.raises(ValueError, match="log_std"):
         floor_std(th.nn.Linear(1, 1), 0.1)
 

@@ -10,8 +10,10 @@ import pytest
 import torch as th
 from environments import Corridor
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.weighing import normalized
 
 GAMMA = 0.5
 N_OBS = 5
@@ -36,14 +38,14 @@ def time_squared(rollout):
     return rollout.timesteps.double() ** 2
 
 
-def learn(n_rollouts=1, n_envs=1, truncate=False, **kwargs):
+def learn(n_rollouts=1, n_envs=1, truncate=False, critic_learning_rate=0.0, **kwargs):
     """Train for some rollouts, at rate 0 until the last; return the model, the parameters before, and the logs."""
     env = make_vec_env(lambda: Logging(truncate), n_envs, seed=0)
     model = REINFORCE(
         "MlpPolicy",
         env,
         learning_rate=lambda progress: float(progress < 0.5 / n_rollouts),
-        critic_learning_rate=0.0,
+        critic_learning_rate=critic_learning_rate,
         gamma=GAMMA,
         policy_kwargs={"net_arch": [], "optimizer_class": th.optim.SGD},
         seed=1,
@@ -174,6 +176,14 @@ def test_the_step_is_the_formula(
     assert_step_is(model, before, *formula(before, logs, n_rollouts=n_rollouts, **arguments))
 
 
+def test_the_value_baseline_is_the_critic_before_this_rollout_trained_it():
+    arguments = dict(baseline="value", n_steps=16, n_episodes=None, reward_to_go=True, discount_scores=False)
+    arguments["normalize_by"] = "steps"
+    model, before, logs = learn(1, 4, critic_learning_rate=0.5, **arguments)
+    assert_step_is(model, before, *formula(before, logs, n_rollouts=1, **arguments))
+    assert np.abs(model.policy.value_net.weight.detach().numpy() - before["value_net.weight"]).max() > 1
+
+
 @pytest.mark.parametrize("gae_lambda", [0.0, 0.9])
 @pytest.mark.parametrize("mode", [{"n_steps": 16, "n_episodes": None}, {"n_steps": None, "n_episodes": 9}])
 def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
@@ -195,6 +205,91 @@ def test_normalized_advantages_have_mean_zero_and_deviation_one():
     scores = np.eye(2)[actions] - np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
     expected = (weights[:, None] * scores).T @ observations / (16 * 4)
     np.testing.assert_allclose(step_of(plain, before)["action_net.weight"], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [{"n_steps": 16}, {"n_episodes": 4}, {"n_episodes": 4, "normalize_by": "episodes"}])
+def test_the_entropy_bonus_raises_the_entropy_over_the_same_denominator(mode):
+    """The steps with and without it differ by ent_coef · Σ m_t ∇H / denominator, H the entropy at each used step."""
+    plain, before, _ = learn(1, 4, baseline="none" if "n_episodes" in mode else "value", **mode)
+    model, _, _ = learn(1, 4, baseline="none" if "n_episodes" in mode else "value", ent_coef=0.5, **mode)
+    ours = step_of(model, before)["action_net.weight"] - step_of(plain, before)["action_net.weight"]
+    rollout = model._rollout
+    weight = th.tensor(before["action_net.weight"], requires_grad=True)
+    logits = rollout.observations[rollout.used].double() @ weight.T + th.tensor(before["action_net.bias"])
+    entropy = -(logits.softmax(1) * logits.log_softmax(1)).sum()
+    expected = 0.5 * th.autograd.grad(entropy, weight)[0] / model._denominator(rollout)
+    np.testing.assert_allclose(ours, expected, atol=2e-4 * np.abs(step_of(plain, before)["action_net.weight"]).max())
+    assert model.logger.name_to_value["train/entropy_loss"] == pytest.approx(-entropy.item() / len(logits), rel=1e-5)
+
+
+class SharedExtractor(FlattenExtractor):
+    """A linear extractor that actor and critic share."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.linear = th.nn.Linear(N_OBS, N_OBS, bias=False)
+
+    def forward(self, observations):
+        return self.linear(super().forward(observations))
+
+
+def test_a_shared_extractor_descends_the_critics_error_too():
+    """The steps at two weights of the error differ by (difference of the weights) · ∇ mean (G − V)²."""
+    steps, model = [], None
+    for vf_coef in (0.0, 0.25):
+        env = make_vec_env(lambda: Corridor((N_OBS,), reward=lambda t, action: float(t + action)), 2, seed=0)
+        kwargs = {"net_arch": [], "features_extractor_class": SharedExtractor, "optimizer_class": th.optim.SGD}
+        model = REINFORCE(
+            "MlpPolicy", env, learning_rate=1.0, critic_learning_rate=0.0, vf_coef=vf_coef, n_steps=6,
+            max_grad_norm=None, policy_kwargs=kwargs, seed=0, device="cpu",
+        )  # fmt: skip
+        extractor = model.policy.features_extractor.linear.weight
+        before = extractor.detach().clone()
+        model.learn(12)
+        steps.append(extractor.detach() - before)
+    weight = before.clone().requires_grad_()
+    features = th.as_tensor(model.rollout_buffer.observations).flatten(0, 1)
+    values = features @ weight.T @ model.policy.value_net.weight.T + model.policy.value_net.bias
+    error = (th.as_tensor(model.rollout_buffer.returns).flatten() - values.flatten()).square().mean()
+    th.testing.assert_close(steps[1] - steps[0], -0.25 * th.autograd.grad(error, weight)[0], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("max_grad_norm", [None, 0.1])
+def test_a_pass_of_the_critic_descends_its_error(max_grad_norm):
+    """One pass in one batch at rate 1 is −∇ mean (G − V)², clipped to the norm allowed; G and b are from before."""
+    env = make_vec_env(lambda: Logging(False), 2, seed=0)
+    kwargs = {"net_arch": [], "optimizer_class": th.optim.SGD}
+    model = REINFORCE(
+        "MlpPolicy", env, learning_rate=0.0, critic_learning_rate=1.0, n_steps=8, n_critic_updates=1, batch_size=16,
+        max_grad_norm=max_grad_norm, policy_kwargs=kwargs, seed=0, device="cpu",
+    )  # fmt: skip
+    before = model.policy.value_net.weight.detach().clone()
+    bias = model.policy.value_net.bias.detach().clone()
+    model.learn(16)
+    buffer = model.rollout_buffer
+    weight = before.clone().requires_grad_()
+    values = (th.as_tensor(buffer.observations).flatten(0, 1) @ weight.T + bias).flatten()
+    returns = th.as_tensor(buffer.returns).flatten()
+    np.testing.assert_allclose(buffer.values.ravel(), values.detach(), rtol=1e-5)
+    np.testing.assert_allclose(buffer.advantages.ravel(), returns - values.detach(), rtol=1e-4, atol=1e-3)
+    expected = -th.autograd.grad((returns - values).square().mean(), weight)[0]
+    moved = model.policy.value_net.weight.detach() - before
+    if max_grad_norm is None:
+        th.testing.assert_close(moved, expected, rtol=1e-4, atol=1e-3)
+    else:
+        bias_moved = model.policy.value_net.bias.detach() - bias
+        assert th.cat([moved.flatten(), bias_moved]).norm().item() == pytest.approx(max_grad_norm, rel=1e-3)
+        th.testing.assert_close(moved / moved.norm(), expected / expected.norm())
+    variance = 1 - (returns - values.detach()).var() / returns.var()
+    assert model.logger.name_to_value["train/explained_variance"] == pytest.approx(variance.item(), abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 3, 32, 777])
+def test_weights_that_do_not_differ_are_not_normalized(n):
+    """Their deviation is 0 but for rounding, which must not be blown up."""
+    same = th.full((n,), 123.4567)
+    assert th.equal(normalized(same), same)
+    assert normalized(th.tensor([1.0, 3.0])).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.5, 3.0])

@@ -50,10 +50,12 @@ def test_discounted_sum_is_the_recursion(n_steps):
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.9, 1.0])
-def test_reward_to_go_is_the_double_sum(rollout, gamma):
+def test_reward_to_go_and_lambda_return_at_one_are_the_double_sum(rollout, gamma):
     rewards, dones, _, next_values = rollout
     expected = double_sum(rewards, dones, gamma, next_values)
-    np.testing.assert_allclose(reward_to_go(rewards, dones, gamma, next_values), expected, atol=1e-12)
+    np.testing.assert_allclose(lambda_return(rewards, dones, next_values, gamma, 1.0), expected, atol=1e-12)
+    expected = double_sum(rewards, dones, gamma, np.zeros_like(rewards))
+    np.testing.assert_allclose(reward_to_go(rewards, dones, gamma), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])

@@ -120,7 +120,7 @@ def test_without_a_critic_the_value_network_changes_nothing(baseline, mode, trun
         set_value_network(model, value)
         keep = Keep(lambda model: (model.rollout_buffer.returns.copy(), model.rollout_buffer.advantages.copy()))
         model.learn(100, callback=keep)
-        actor = [parameter.clone() for parameter in model._actor_parameters]
+        actor = [parameter.clone() for parameter in model.policy.mlp_extractor.policy_net.parameters()]
         outcomes.append((keep.kept, actor))
     (kept, actor), (kept_too, actor_too) = outcomes
     np.testing.assert_array_equal(kept[0], kept_too[0])
@@ -128,8 +128,9 @@ def test_without_a_critic_the_value_network_changes_nothing(baseline, mode, trun
 
 
 @pytest.mark.parametrize("method", ["predict_values", "forward_critic"])
-def test_without_a_critic_the_value_network_is_never_evaluated(method, monkeypatch):
-    model = make_model("CartPole-v1", 2, baseline="leave_one_out", n_episodes=4)
+@pytest.mark.parametrize("baseline", [name for name in BASELINES if name != "value"])
+def test_without_a_critic_the_value_network_is_never_evaluated(baseline, method, monkeypatch):
+    model = make_model("CartPole-v1", 2, baseline=baseline, n_episodes=4)
     owner = model.policy if method == "predict_values" else model.policy.mlp_extractor
     monkeypatch.setattr(owner, method, None)
     model.learn(200)

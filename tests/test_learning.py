@@ -1,0 +1,62 @@
+"""It learns: a small version in a few seconds, and the README's claim on all its seeds."""
+
+import gymnasium as gym
+import pytest
+from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import IdentityEnv, IdentityEnvBox, IdentityEnvMultiBinary, IdentityEnvMultiDiscrete
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecMonitor
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.vec_env import GymnasiumVecEnv
+
+
+@pytest.mark.parametrize("baseline", ["none", "time_mean", "leave_one_out", "value"])
+@pytest.mark.parametrize("env_class", [IdentityEnv, IdentityEnvMultiDiscrete, IdentityEnvMultiBinary, IdentityEnvBox])
+def test_to_repeat_the_observation(env_class, baseline):
+    """Nearly all of the 100 rewards of an episode, from each action space and with and without a critic."""
+    box = env_class is IdentityEnvBox
+    env = env_class(eps=0.5) if box else env_class(3)
+    mode = {"n_steps": 32} if baseline == "value" else {"n_episodes": 2}
+    model = REINFORCE(
+        "MlpPolicy", env, baseline=baseline, gamma=0.4, learning_rate=5e-3, seed=0, normalize_advantage=True, **mode,
+        policy_kwargs={"log_std_init": -0.5} if box else {}, device="cpu",
+    ).learn(12_000)  # fmt: skip
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=10, warn=False)
+    assert mean >= 90
+
+
+def train_on_cart_pole(seed, env=None):
+    """As ``examples/1_reinforce.py``: stop once 20 episodes score 490."""
+    stop = StopTrainingOnRewardThreshold(reward_threshold=490, verbose=0)
+    evaluation = EvalCallback(
+        make_vec_env("CartPole-v1", 5, seed=1000 + seed), callback_on_new_best=stop, n_eval_episodes=20, verbose=0,
+        eval_freq=4000 // (env.num_envs if env else 8),
+    )  # fmt: skip
+    env = env or make_vec_env("CartPole-v1", 8, seed=seed)
+    model = REINFORCE("MlpPolicy", env, gae_lambda=0.95, seed=seed, device="cpu")
+    return model.learn(150_000, callback=evaluation)
+
+
+def score(model, seed):
+    return evaluate_policy(model, make_vec_env("CartPole-v1", 5, seed=2000 + seed), n_eval_episodes=100)[0]
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3, 4))])
+def test_cart_pole_is_solved(seed):
+    model = train_on_cart_pole(seed)
+    assert model.num_timesteps <= 150_000 and score(model, seed) >= 475
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_cart_pole_is_solved_on_a_native_vector_environment(seed):
+    env, eval_env = (
+        VecMonitor(GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point")))
+        for n_envs in (256, 5)
+    )
+    model = REINFORCE("MlpPolicy", env, n_steps=8, gae_lambda=0.95, seed=seed, device="cpu", batch_size=512)
+    stop = StopTrainingOnRewardThreshold(reward_threshold=490, verbose=0)
+    evaluation = EvalCallback(eval_env, callback_on_new_best=stop, n_eval_episodes=20, eval_freq=40, verbose=0)
+    assert score(model.learn(1_000_000, callback=evaluation), seed) >= 475
