@@ -7,12 +7,13 @@ function is a baseline too. This module looks up to ``rollouts``, whose ``Rollou
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeAlias
 
 import torch as th
 
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import episode_gradients
+from sb3_reinforce.scores import CHUNK, gradients_by_episode
 
 Baseline: TypeAlias = Callable[[Rollout], th.Tensor]
 
@@ -87,9 +88,12 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     numbers = th.unique(rollout.episodes[rollout.used])
-    gradients = episode_gradients(rollout, rollout.discounts * rollout.returns, rollout.discounts)
-    for number, (weighted, score) in zip(numbers, gradients, strict=True):
-        products[number] = th.stack([weighted @ score, score @ score]).cpu().double()
+    for group in numbers.split(
+        max(1, CHUNK // (2 * sum(parameter.numel() for parameter in rollout.policy.parameters())))
+    ):
+        part = replace(rollout, used=rollout.used & th.isin(rollout.episodes, group))
+        weighted, scores = gradients_by_episode(part, rollout.discounts * rollout.returns, rollout.discounts)
+        products[group] = th.stack([(weighted * scores).sum(1), scores.square().sum(1)], dim=1).cpu().double()
     return products[:, 0], products[:, 1]
 
 

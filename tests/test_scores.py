@@ -1,0 +1,112 @@
+"""The gradients of all episodes at once are those of one backward pass each, whatever the policy and the memory."""
+
+from dataclasses import replace
+
+import pytest
+import torch as th
+from environments import Corridor
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.scores import PIECE, episode_gradients, gradients_by_episode
+
+ACTION_SPACES = [
+    spaces.Discrete(3),
+    spaces.Box(-1, 1, (2,)),
+    spaces.MultiDiscrete([2, 3]),
+    spaces.MultiBinary(2),
+]
+
+
+def collect(env, policy="MlpPolicy", n_episodes=5, **kwargs):
+    model = REINFORCE(policy, env, baseline="none", n_episodes=n_episodes, learning_rate=0.0, device="cpu", **kwargs)
+    return model.learn(1)._rollout
+
+
+def assert_as_one_by_one(rollout, **kwargs):
+    weights = rollout.returns, th.randn(rollout.returns.shape)
+    before = list(rollout.policy.named_parameters(remove_duplicate=False))
+    together = gradients_by_episode(rollout, *weights, **kwargs)
+    alone = th.stack([th.stack(gradients) for gradients in episode_gradients(rollout, *weights)], dim=1)
+    assert alone.abs().max() > 0
+    after = rollout.policy.named_parameters(remove_duplicate=False)
+    assert all(old is new for (_, old), (_, new) in zip(before, after, strict=True)), "the policy is as it was"
+    th.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4 * float(alone.abs().max()))
+
+
+@pytest.mark.parametrize("action_space", ACTION_SPACES)
+@pytest.mark.parametrize("chunk", [1, 2**25])
+def test_every_action_space_and_any_memory(action_space, chunk):
+    """Episodes shorter and longer than a piece, in environments that go on after their quota."""
+    env = make_vec_env(lambda: Corridor((1, 7, 2 * PIECE + 3), action_space=action_space), 2, seed=0)
+    assert_as_one_by_one(collect(env), chunk=chunk)
+
+
+@pytest.mark.parametrize("kwargs", [{"temperature": 0.3}, {"policy_kwargs": {"net_arch": [8, 8], "ortho_init": False}}])
+def test_other_mlp_policies(kwargs):
+    assert_as_one_by_one(collect(Corridor((2, 9)), **kwargs))
+
+
+def test_gsde():
+    assert_as_one_by_one(collect(Corridor((2, 9), action_space=spaces.Box(-1, 1, (2,))), use_sde=True))
+
+
+def test_images():
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=True)
+    assert_as_one_by_one(collect(env, "CnnPolicy", n_episodes=2))
+
+
+def test_dict_observations():
+    assert_as_one_by_one(collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2))
+
+
+class Branching(ActorCriticPolicy):
+    """Looks at its data, which vmap cannot trace."""
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob * (2.0 if float(obs.sum()) > 0 else 1.0), entropy
+
+
+def test_a_policy_that_cannot_be_traced_is_taken_one_by_one():
+    assert_as_one_by_one(collect(Corridor((2, 9)), Branching))
+
+
+class Detached(ActorCriticPolicy):
+    """Computes log π without a graph."""
+
+    @th.no_grad()
+    def evaluate_actions(self, obs, actions):
+        return super().evaluate_actions(obs, actions)
+
+
+def test_a_policy_without_a_gradient_is_named():
+    rollout = collect(Corridor((2, 9)))
+    detached = REINFORCE(Detached, Corridor((2, 9)), device="cpu").policy
+    with pytest.raises(ValueError, match=r"Detached cannot be differentiated"):
+        gradients_by_episode(replace(rollout, policy=detached), rollout.returns)
+
+
+def test_memory_beside_the_result_is_bounded():
+    """The widest intermediate has ``chunk`` floats and not those of all pieces."""
+    rollout, widest = collect("Pendulum-v1", n_episodes=2), []
+
+    class Watch(th.utils._python_dispatch.TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            result = function(*args, **(kwargs or {}))
+            widest.append(result.numel() if isinstance(result, th.Tensor) else 0)
+            return result
+
+    def peak(chunk):
+        widest.clear()
+        with Watch():
+            n = gradients_by_episode(rollout, rollout.returns, chunk=chunk).shape[-1]
+        return max(widest), n
+
+    bounded, n = peak(1)
+    n_pieces = 2 * -(-200 // PIECE)
+    assert bounded <= 2 * n
+    assert peak(2**25)[0] >= n_pieces * n
