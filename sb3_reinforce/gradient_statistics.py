@@ -1,0 +1,233 @@
+"""
+How good an estimate of the gradient is: statistics of m sampled gradients, each with an interval.
+
+A sample is the gradient of one episode, or of one batch; the estimate is the mean of the samples. All of them
+are functions of ``E‖g‖²`` and ``‖E g‖²``, of which the Gram matrix ``K_ij = ⟨g_i, g_j⟩`` has unbiased estimates. So a
+bootstrap costs m² a resample, whatever the number of parameters.
+
+The samples are taken to be independent. Those of a baseline that looks at the other episodes of the batch are so up to
+terms of order 1/m.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch as th
+
+from sb3_reinforce.arguments import check_integer, check_number
+
+
+@dataclass(frozen=True)
+class Moments:
+    """
+    Of a gradient g, or of its resamples.
+
+    :param second: ``E‖g‖²``
+    :param signal: ``‖E g‖²``; an unbiased estimate of it can be negative
+    """
+
+    second: th.Tensor
+    signal: th.Tensor
+
+
+Statistic: TypeAlias = Callable[[Moments], th.Tensor]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    A number that was estimated.
+
+    :param value: The estimate
+    :param low: Lower end of its interval
+    :param high: Upper end of its interval
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+@dataclass(frozen=True)
+class GradientStatistics:
+    """
+    What ``gradient_statistics`` returns.
+
+    :param mean: The estimate of the gradient, ``(1/m) Σ_i g_i``, shape ``(n,)``
+    :param variance: ``tr Σ``, the trace of the covariance of one sample; the mean of N samples has ``tr Σ / N``
+    :param snr: ``‖E g‖² / tr Σ``, the signal-to-noise ratio of one sample; the mean of N samples has N times that
+    :param noise_scale: ``tr Σ / ‖E g‖²``, the number of samples whose mean is as much signal as noise
+    :param cosine: Cosine of the true gradient to the reference gradient; None without one
+    """
+
+    mean: th.Tensor
+    variance: Estimate
+    snr: Estimate
+    noise_scale: Estimate
+    cosine: Estimate | None
+
+
+def moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
+    """
+    ``E‖g‖² ≈ Σ_i c_i K_ii / Σ_i c_i`` and ``‖E g‖² ≈ Σ_{i≠j} c_i c_j K_ij / Σ_{i≠j} c_i c_j``.
+
+    Both are unbiased for counts of 1. The second leaves out the pairs of a sample with itself, and of a resample with
+    its own copies, which would count noise as signal (a U-statistic: Hoeffding, 1948).
+
+    :param gram: ``K_ij = ⟨g_i, g_j⟩``, shape ``(m, m)``
+    :param counts: How often each sample is in each resample, shape ``(r, m)``
+    :return: Moments of shape ``(r,)``
+    """
+    diagonal = gram.diagonal()
+    second = counts @ diagonal / counts.sum(1)
+    pairs = ((counts @ gram) * counts).sum(1) - counts.square() @ diagonal
+    return Moments(second, pairs / (counts.sum(1).square() - counts.square().sum(1)))
+
+
+def variance(of: Moments) -> th.Tensor:
+    """
+    ``tr Σ = E‖g‖² − ‖E g‖²``. Unbiased: it is the trace of the sample covariance with denominator m − 1.
+
+    :param of: Moments
+    """
+    return of.second - of.signal
+
+
+def signal_to_noise(of: Moments) -> th.Tensor:
+    """
+    ``SNR = ‖E g‖² / tr Σ`` (Roberts and Tedrake, 2009, "Signal-to-noise ratio analysis of policy gradient
+    algorithms", there with the part of the noise that is orthogonal to E g).
+
+    Consistent; a ratio of two unbiased numbers is not unbiased itself. Negative where there is more noise than signal
+    to be seen.
+
+    :param of: Moments
+    """
+    return of.signal / variance(of)
+
+
+def noise_scale(of: Moments) -> th.Tensor:
+    """
+    ``B = tr Σ / ‖E g‖²`` (McCandlish et al., 2018, equation 2.9), infinite where no signal is seen.
+
+    From the unbiased estimates of numerator and denominator, as in their appendix A.1.
+
+    :param of: Moments
+    """
+    return th.where(of.signal > 0, variance(of) / of.signal, th.inf)
+
+
+def check_gradients(gradients: th.Tensor) -> th.Tensor:
+    """
+    Check sampled gradients.
+
+    :param gradients: Meant to be of shape ``(m, n)`` with m ≥ 2, and finite
+    :return: The gradients, float64, on the CPU
+    :raises TypeError: If they are not a tensor
+    :raises ValueError: If they are not as meant
+    """
+    if not isinstance(gradients, th.Tensor):
+        raise TypeError(f"gradients must be a tensor, got {gradients!r} of type {type(gradients).__name__}")
+    if gradients.dim() != 2 or len(gradients) < 2 or gradients.shape[1] < 1:
+        raise ValueError(
+            f"gradients must be of shape (m, n) with m >= 2, since a variance needs two samples, got "
+            f"{tuple(gradients.shape)}"
+        )
+    if not gradients.isfinite().all():
+        raise ValueError(
+            f"gradients must be finite, and sample {int((~gradients.isfinite()).any(1).nonzero()[0])} is not"
+        )
+    return gradients.detach().cpu().double()
+
+
+def resamples(m: int, n_resamples: int, seed: int) -> th.Tensor:
+    """
+    How often each of m samples is drawn, in the sample itself (the first row) and in bootstrap resamples of it.
+
+    A resample that holds one sample m times has no pairs and is drawn anew, as if by m samples of which two differ.
+
+    :param m: Number of samples, at least 2
+    :param n_resamples: Number of resamples
+    :param seed: Of the draws: with the same seed, the resamples of two estimators are paired
+    :return: Shape ``(1 + n_resamples, m)``, float64
+    """
+    drawn = th.randint(m, (n_resamples, m), generator=th.Generator().manual_seed(seed))
+    drawn[:, 1] = th.where((drawn == drawn[:, :1]).all(1), (drawn[:, 0] + 1) % m, drawn[:, 1])
+    counts = th.zeros(n_resamples, m, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
+    return th.cat([th.ones(1, m, dtype=th.float64), counts])
+
+
+def interval(values: th.Tensor, confidence: float) -> Estimate:
+    """
+    The percentile interval of the bootstrap (Efron and Tibshirani, 1993, chapter 13).
+
+    :param values: The statistic of the sample, then of its resamples, shape ``(1 + r,)``
+    :param confidence: Probability that the interval is to cover the truth
+    """
+    tail = (1 - confidence) / 2
+    # An end is a value that occurred: infinite noise scales cannot be interpolated
+    low = values[1:].quantile(tail, interpolation="lower")
+    high = values[1:].quantile(1 - tail, interpolation="higher")
+    return Estimate(float(values[0]), float(low), float(high))
+
+
+def cosine(of: Moments, products: th.Tensor) -> th.Tensor:
+    """
+    ``cos = ⟨E g, r⟩ / (‖E g‖ ‖r‖)`` to a reference r, and 0 where no signal is seen.
+
+    Consistent for the true gradient: with the norm of the mean of the samples in the denominator, their noise would
+    make it too small, by about ``√(1 + B / m)`` at the noise scale B.
+
+    :param of: Moments of g
+    :param products: ``⟨E g, r⟩ / ‖r‖``, of the same shape
+    """
+    return th.where(of.signal > 0, products / of.signal.clamp(min=1e-300).sqrt(), 0.0).clamp(-1, 1)
+
+
+def gradient_statistics(
+    gradients: th.Tensor,
+    reference: th.Tensor | None = None,
+    n_resamples: int = 1000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> GradientStatistics:
+    """
+    Mean, variance, signal-to-noise ratio and noise scale of sampled gradients, with bootstrap intervals.
+
+    Where there is next to no signal (SNR of the mean below about 1), the intervals of SNR, noise scale and cosine are
+    wider than they need be.
+
+    :param gradients: m independent samples of the gradient, shape ``(m, n)``
+    :param reference: A gradient to compare the mean with, shape ``(n,)``
+    :param n_resamples: Bootstrap resamples
+    :param confidence: Probability that an interval is to cover the truth
+    :param seed: Seed of the resamples
+    :raises TypeError: If the gradients are not a tensor
+    :raises ValueError: If there are fewer than two, if they are not finite, or do not go with the reference
+    """
+    gradients = check_gradients(gradients)
+    check_number("confidence", confidence, 0, 1)
+    counts = resamples(len(gradients), check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
+    gram = gradients @ gradients.T
+    found = moments(gram, counts)
+    to_reference = None
+    if reference is not None:
+        if reference.shape != gradients.shape[1:] or not reference.norm() > 0:
+            raise ValueError(
+                f"reference must be a nonzero gradient of shape (n,) = {tuple(gradients.shape[1:])}, got shape "
+                f"{tuple(reference.shape)} and norm {float(reference.norm())}"
+            )
+        direction = reference.detach().cpu().double() / reference.norm().cpu()
+        products = counts @ (gradients @ direction) / counts.sum(1)
+        to_reference = interval(cosine(found, products), confidence)
+    return GradientStatistics(
+        mean=gradients.mean(0),
+        variance=interval(variance(found), confidence),
+        snr=interval(signal_to_noise(found), confidence),
+        noise_scale=interval(noise_scale(found), confidence),
+        cosine=to_reference,
+    )

@@ -1,0 +1,121 @@
+"""Statistics of sampled gradients against Gaussians whose statistics are known, and against enumeration."""
+
+from itertools import product
+
+import pytest
+import torch as th
+from environments import Tree
+from test_enumeration import LOGITS, episode_terms, log_pi
+
+from sb3_reinforce.gradient_statistics import (
+    Moments,
+    gradient_statistics,
+    interval,
+    moments,
+    noise_scale,
+    resamples,
+    signal_to_noise,
+    variance,
+)
+
+MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
+FACTOR = th.randn(8, 8, dtype=th.float64, generator=th.Generator().manual_seed(3))
+TRACE, SIGNAL = float(FACTOR.square().sum()), float(MEAN @ MEAN)
+
+
+def draw(m, generator):
+    """Gradients of mean MEAN and covariance FACTORᵀ FACTOR, whose trace is TRACE."""
+    return MEAN + th.randn(m, 8, dtype=th.float64, generator=generator) @ FACTOR
+
+
+def test_the_moments_are_those_of_the_sample_covariance():
+    gradients = draw(12, th.Generator().manual_seed(0))
+    found = moments(gradients @ gradients.T, th.ones(1, 12, dtype=th.float64))
+    th.testing.assert_close(variance(found)[0], gradients.var(0).sum())
+    th.testing.assert_close(found.second[0], gradients.square().sum(1).mean())
+    th.testing.assert_close(found.signal[0], gradients.mean(0).square().sum() - gradients.var(0).sum() / 12)
+
+
+def test_counts_are_repeated_samples_without_their_pairs_with_themselves():
+    gradients, counts = draw(4, th.Generator().manual_seed(1)), th.tensor([[3.0, 0.0, 2.0, 1.0]], dtype=th.float64)
+    found = moments(gradients @ gradients.T, counts)
+    labels = [0, 0, 0, 2, 2, 3]
+    pairs = [gradients[i] @ gradients[j] for i, j in product(labels, repeat=2) if i != j]
+    th.testing.assert_close(found.signal[0], th.stack(pairs).mean())
+    th.testing.assert_close(found.second[0], gradients[labels].square().sum(1).mean())
+
+
+def test_variance_and_signal_are_unbiased_on_the_tree():
+    """Σ over all samples of 3 episodes of p(sample) · statistic is the statistic of the distribution."""
+    trajectories = Tree().trajectories()
+    gradients = th.stack([episode_terms(trajectory, True)[0] for trajectory in trajectories])
+    p = th.stack([th.stack([log_pi(LOGITS, n, a) for n, a, _ in t]).sum().exp() for t in trajectories])
+    signal = (p @ gradients).square().sum()
+    trace = p @ gradients.square().sum(1) - signal
+    expected = th.zeros(2, dtype=th.float64)
+    for sample in product(range(len(trajectories)), repeat=3):
+        chosen = gradients[list(sample)]
+        found = moments(chosen @ chosen.T, th.ones(1, 3, dtype=th.float64))
+        expected += p[list(sample)].prod() * th.stack([variance(found)[0], found.signal[0]])
+    th.testing.assert_close(expected, th.stack([trace, signal]), rtol=0, atol=1e-10)
+
+
+def test_ratios_are_each_others_inverse_and_no_signal_is_an_infinite_noise_scale():
+    some, nothing = Moments(th.tensor(5.0), th.tensor(1.0)), Moments(th.tensor(5.0), th.tensor(-1.0))
+    assert float(signal_to_noise(some)) == 1 / float(noise_scale(some)) == 0.25
+    assert noise_scale(nothing) == th.inf
+    assert signal_to_noise(nothing) < 0
+
+
+def test_resamples_have_m_samples_of_which_two_differ():
+    counts = resamples(2, 200, seed=0)
+    assert counts[0].tolist() == [1, 1]
+    assert (counts.sum(1) == 2).all()
+    assert ((counts > 0).sum(1) == 2).all()
+    assert th.equal(counts, resamples(2, 200, seed=0))
+    assert not th.equal(resamples(9, 5, seed=0), resamples(9, 5, seed=1))
+
+
+@pytest.mark.parametrize("m", [32, 64])
+def test_95_percent_intervals_cover_the_truth_in_90_to_98_percent_of_500_repetitions(m):
+    generator, covered = th.Generator().manual_seed(0), th.zeros(4)
+    reference = th.ones(8, dtype=th.float64) + MEAN
+    truth = [TRACE, SIGNAL / TRACE, TRACE / SIGNAL, float(MEAN @ reference / MEAN.norm() / reference.norm())]
+    for seed in range(500):
+        found = gradient_statistics(draw(m, generator), reference, n_resamples=400, seed=seed)
+        estimates = [found.variance, found.snr, found.noise_scale, found.cosine]
+        covered += th.tensor([e.low <= t <= e.high for e, t in zip(estimates, truth, strict=True)]).float()
+    assert ((0.90 <= covered / 500) & (covered / 500 <= 0.98)).all(), covered / 500
+
+
+def test_many_samples_give_the_closed_forms():
+    found = gradient_statistics(draw(4000, th.Generator().manual_seed(5)), MEAN, n_resamples=10)
+    assert found.variance.value == pytest.approx(TRACE, rel=0.05)
+    assert found.snr.value == pytest.approx(SIGNAL / TRACE, rel=0.1)
+    assert found.noise_scale.value == pytest.approx(TRACE / SIGNAL, rel=0.1)
+    assert found.cosine.value > 0.99
+    th.testing.assert_close(found.mean, MEAN, atol=0.2, rtol=0)
+
+
+def test_an_interval_holds_its_estimate_and_can_be_infinite():
+    values = th.cat([th.tensor([2.0]), th.linspace(0, 4, 99), th.tensor([th.inf])]).double()
+    assert interval(values, 0.9).low < interval(values, 0.9).value < interval(values, 0.9).high
+    assert interval(values, 0.999).high == th.inf
+
+
+@pytest.mark.parametrize(
+    ("gradients", "kwargs", "message"),
+    [
+        (th.ones(1, 3), {}, r"m >= 2.*\(1, 3\)"),
+        (th.ones(3), {}, r"shape \(m, n\).*\(3,\)"),
+        (th.tensor([[1.0], [float("nan")]]), {}, "finite, and sample 1"),
+        ([[1.0], [2.0]], {}, "must be a tensor"),
+        (th.ones(2, 3), {"reference": th.ones(2)}, r"reference.*\(2,\)"),
+        (th.ones(2, 3), {"reference": th.zeros(3)}, r"reference.*norm 0"),
+        (th.ones(2, 3), {"confidence": 95}, "confidence"),
+        (th.ones(2, 3), {"n_resamples": 0}, "n_resamples"),
+    ],
+)
+def test_what_cannot_be_measured_is_named(gradients, kwargs, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        gradient_statistics(gradients, **kwargs)
