@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy, reached
 from sb3_reinforce.rollouts import Rollout, select, take
 
-# Steps that share a gradient while they are summed: fewer would write more gradients, more would pad short episodes
-PIECE = 32
+# The most steps that share a gradient while they are summed: fewer would write more gradients
+PIECE = 128
 # Floats that the gradients of one chunk may take, 128 MiB in float32
 CHUNK = 2**25
 
@@ -89,21 +89,23 @@ def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHU
 
 def pieces_of(episodes: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Cut episodes into pieces of ``PIECE`` steps, the last of an episode padded.
+    Cut episodes into pieces of one length, at most ``PIECE``, the last of an episode padded.
 
     :param episodes: The episode that each used step belongs to, shape ``(n_used,)``
-    :return: The rank of the episode of each piece, shape ``(p,)``; the steps of each piece, shape ``(p, PIECE)``; and
+    :return: The rank of the episode of each piece, shape ``(p,)``; the steps of each piece, shape ``(p, length)``; and
         which of these are not padding
     """
     _, rank, lengths = th.unique(episodes, return_inverse=True, return_counts=True)
     order = rank.argsort(stable=True)
     place = th.arange(len(order)) - (lengths.cumsum(0) - lengths)[rank[order]]
-    n_pieces = (lengths + PIECE - 1) // PIECE
-    piece = (n_pieces.cumsum(0) - n_pieces)[rank[order]] + place // PIECE
-    slots = th.zeros(int(n_pieces.sum()), PIECE, dtype=th.long)
+    # Longer than the mean episode, most of a piece would be padding
+    length = int(lengths.double().mean().ceil().clamp(max=PIECE))
+    n_pieces = (lengths + length - 1) // length
+    piece = (n_pieces.cumsum(0) - n_pieces)[rank[order]] + place // length
+    slots = th.zeros(int(n_pieces.sum()), length, dtype=th.long)
     filled = th.zeros_like(slots, dtype=th.bool)
-    slots[piece, place % PIECE] = order
-    filled[piece, place % PIECE] = True
+    slots[piece, place % length] = order
+    filled[piece, place % length] = True
     return th.repeat_interleave(n_pieces), slots, filled
 
 

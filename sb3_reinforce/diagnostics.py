@@ -1,0 +1,22 @@
+"""
+The gradient lab: how good the estimate of the gradient is, whether it is right, and what to change.
+
+This module hands on the public names of its rooms.
+"""
+
+from sb3_reinforce.comparisons import BaselineRow, compare_baselines
+from sb3_reinforce.gradient_statistics import Estimate, GradientStatistics, gradient_statistics
+from sb3_reinforce.sampling import sample
+from sb3_reinforce.scores import gradients_by_episode
+from sb3_reinforce.tables import Table
+
+__all__ = [
+    "BaselineRow",
+    "Estimate",
+    "GradientStatistics",
+    "Table",
+    "compare_baselines",
+    "gradient_statistics",
+    "gradients_by_episode",
+    "sample",
+]

@@ -1,0 +1,100 @@
+"""Episodes for a measurement: collected by the model's own code, without a change to the model."""
+
+import copy
+from collections import deque
+from typing import Any, TypeVar
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce.arguments import check_integer
+from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.rollouts import Rollout
+
+AnyREINFORCE = TypeVar("AnyREINFORCE", bound=REINFORCE)
+
+
+class Infos(BaseCallback):
+    """Keeps the infos of every step: ``infos[t][i]`` of environment i."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.infos: list[list[dict[str, Any]]] = []
+
+    def _on_step(self) -> bool:
+        self.infos.append(self.locals["infos"])
+        return True
+
+
+def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Rollout:
+    """
+    Whole episodes of the model's policy in its environments, with the model's own returns.
+
+    The model keeps its parameters, counters and log, and the statistics of a VecNormalize stay as they are; its
+    environments are left at the start of an episode.
+
+    :param model: The model
+    :param n_episodes: Number of episodes, at least 2
+    :param baseline: The baseline to collect with; None for ``"value"`` where the model has a critic, else ``"none"``
+    :return: The rollout; ``values`` only where the model has a critic
+    :raises TypeError: If the model is not a REINFORCE
+    :raises ValueError: If there are too few episodes, or the model has no environment
+    """
+    sampler, _ = sampled(model, n_episodes, baseline)
+    assert sampler._rollout is not None
+    return sampler._rollout
+
+
+def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | None = None) -> tuple[AnyREINFORCE, Infos]:
+    """
+    A copy of the model, which shares its policy and environments, after it has collected a rollout; and the infos.
+
+    :param model: The model
+    :param n_episodes: Number of episodes, at least 2
+    :param baseline: As for ``sample``
+    :raises TypeError: If the model is not a REINFORCE
+    :raises ValueError: If there are too few episodes, or the model has no environment
+    """
+    env = check_model(model)
+    sampler = copy.copy(model)
+    sampler.n_steps, sampler.n_episodes = None, check_integer("n_episodes", n_episodes, 2)  # type: ignore[assignment]
+    sampler.baseline = baseline or ("value" if model.has_critic else "none")
+    sampler._logger = Logger(folder=None, output_formats=[])
+    sampler.ep_info_buffer, sampler.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
+    sampler.rollout_buffer = model.rollout_buffer_class(  # type: ignore[misc]
+        1, env.observation_space, env.action_space, model.device, n_envs=env.num_envs, **model.rollout_buffer_kwargs
+    )
+    callback, normalize = Infos(), model.get_vec_normalize_env()
+    callback.init_callback(sampler)
+    training = normalize is not None and normalize.training
+    try:
+        if normalize is not None:
+            normalize.training = False
+        sampler._last_obs = env.reset()  # type: ignore[assignment]
+        sampler._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        sampler.collect_rollouts(env, callback, sampler.rollout_buffer, None)
+    finally:
+        # In the middle of training too, the model goes on from the start of an episode
+        model._last_obs = env.reset()  # type: ignore[assignment]
+        model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        if normalize is not None:
+            normalize.training = training
+    return sampler, callback
+
+
+def check_model(model: Any) -> VecEnv:
+    """
+    Check that a model can be measured.
+
+    :param model: Meant to be a REINFORCE with an environment
+    :return: Its environments
+    :raises TypeError: If it is not a REINFORCE
+    :raises ValueError: If it has no environment
+    """
+    if not isinstance(model, REINFORCE):
+        raise TypeError(f"model must be a REINFORCE, got {model!r} of type {type(model).__name__}")
+    if model.env is None:
+        raise ValueError("model must have an environment to sample episodes from: call set_env first")
+    return model.env
