@@ -5,6 +5,7 @@ This module hands on the public names of its rooms.
 """
 
 from sb3_reinforce.comparisons import BaselineRow, compare_baselines
+from sb3_reinforce.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.gradient_statistics import Estimate, GradientStatistics, gradient_statistics
 from sb3_reinforce.sampling import sample
 from sb3_reinforce.scores import gradients_by_episode
@@ -12,9 +13,12 @@ from sb3_reinforce.tables import Table
 
 __all__ = [
     "BaselineRow",
+    "CheckRow",
+    "CheckTable",
     "Estimate",
     "GradientStatistics",
     "Table",
+    "check_gradient",
     "compare_baselines",
     "gradient_statistics",
     "gradients_by_episode",

@@ -10,6 +10,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.arguments import check_integer
+from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
 
@@ -47,7 +48,7 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     return sampler._rollout
 
 
-def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | None = None) -> tuple[AnyREINFORCE, Infos]:
+def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | None = None) -> tuple[AnyREINFORCE, Infos]:
     """
     A copy of the model, which shares its policy and environments, after it has collected a rollout; and the infos.
 

@@ -1,0 +1,236 @@
+"""What ``gradient_check`` measures: each function returns how far two sides of an identity are apart."""
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+
+from sb3_reinforce.collection import by_step
+from sb3_reinforce.critic import stack
+from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.rollouts import Rollout, select, take
+from sb3_reinforce.sampling import Infos
+from sb3_reinforce.scores import flat, gradients_by_episode, score_parameters
+
+# Draws behind a frequency or a mean action
+N_DRAWS = 4096
+
+
+def relative(x: th.Tensor, y: th.Tensor) -> float:
+    """
+    ``‖x − y‖ / max(‖x‖, ‖y‖)``, and 0 where both are zero.
+
+    :param x: Any tensor
+    :param y: A tensor of the same shape
+    """
+    scale = max(float(x.norm()), float(y.norm()))
+    return float((x - y).norm()) / scale if scale > 0 else 0.0
+
+
+@th.no_grad()
+def log_prob_error(policy: ActorCriticPolicy, obs: PyTorchObs) -> float:
+    """
+    The largest difference between log π of drawn actions as ``forward`` and as training tell it.
+
+    :param policy: The policy
+    :param obs: Observations
+    """
+    drawn, _, log_prob = policy(obs)
+    evaluated, _ = log_prob_and_entropy(policy, obs, flat_actions(policy, drawn))
+    return float(((evaluated - log_prob).abs() / log_prob.abs().clamp(min=1)).max())
+
+
+def flat_actions(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
+    """
+    Drawn actions in the form that ``evaluate_actions`` takes.
+
+    :param policy: The policy
+    :param drawn: ``n`` actions as ``forward`` returns them
+    """
+    return as_policy_actions(drawn.reshape(len(drawn), -1), policy.action_space)
+
+
+def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, n_directions: int = 16) -> float:
+    """
+    ``⟨∇L, u⟩`` against ``(L(θ + h u) − L(θ − h u)) / 2h`` for random u; ``L = Σ ± log π(a_t|s_t)`` with random signs.
+
+    :param policy: The policy
+    :param obs: ``n`` observations
+    :param actions: ``n`` actions
+    :param n_directions: Number of directions
+    :return: ``‖by autograd − by differences‖ / ‖by differences‖`` over the directions
+    """
+    parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    signs = 2.0 * th.randint(2, (len(actions),)).to(actions.device) - 1
+
+    def objective() -> th.Tensor:
+        return (log_prob_and_entropy(policy, obs, actions)[0].double() * signs).sum()
+
+    found = th.autograd.grad(objective(), parameters, allow_unused=True)
+    gradient = th.cat(
+        [th.zeros_like(p).flatten() if g is None else g.flatten() for p, g in zip(parameters, found, strict=True)]
+    ).double()
+    theta = th.nn.utils.parameters_to_vector(parameters).detach()
+    # In float32 the rounding of log π and the third derivative are in balance near eps^(1/3)
+    step = 5e-3 * max(1.0, float(theta.norm()))
+    by_autograd, by_differences = [], []
+    with th.no_grad():
+        for direction in th.randn(n_directions, len(theta), device=theta.device):
+            direction /= direction.norm()
+            values = []
+            for signed in (step, -step):
+                th.nn.utils.vector_to_parameters(theta + signed * direction, parameters)
+                values.append(objective())
+            th.nn.utils.vector_to_parameters(theta, parameters)
+            by_autograd.append(gradient @ direction.double())
+            by_differences.append((values[0] - values[1]) / (2 * step))
+    return relative(th.stack(by_autograd), th.stack(by_differences))
+
+
+def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -> float:
+    """
+    The share of drawn actions from which the policy moves away by a step along their own score, ``θ + h ∇ log π(a|s)``.
+
+    Whether it does is seen from what it draws, not from any log π: see ``closeness``.
+
+    :param policy: The policy
+    :param obs: ``n`` observations
+    :param n_actions: Actions to try, at most n
+    """
+    n_obs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
+    wrong, tried = 0, 0
+    for index in th.randperm(n_obs)[:n_actions]:
+        repeated = take(obs, index.repeat(N_DRAWS))
+        with th.no_grad():
+            draws = flat_actions(policy, policy(repeated)[0])
+        # Of a few draws the one that is farthest from the rest: a step along its score is the plainest to see
+        action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
+        before, after = closeness_after_step(policy, repeated, action)
+        if before < closeness(policy, action[None].expand_as(draws), action):
+            wrong, tried = wrong + int(after <= before), tried + 1
+    return wrong / max(1, tried)
+
+
+def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:
+    """
+    How near draws are to an action: the mean share of equal components, or for a Box minus the distance of their mean.
+
+    :param policy: The policy
+    :param draws: Shape ``(n,)`` or ``(n, action_dim)``
+    :param action: Shape ``()`` or ``(action_dim,)``
+    """
+    if isinstance(policy.action_space, spaces.Box):
+        distance: th.Tensor = (draws.mean(0) - action).norm()
+        return -distance
+    return (draws == action).double().mean()
+
+
+def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    ``closeness`` before and after a step along the score of an action, with the same random numbers.
+
+    :param policy: The policy; it is left as it was
+    :param obs: One observation, ``N_DRAWS`` times
+    :param action: The action
+    """
+    parameters = score_parameters(policy, take(obs, th.arange(1)), action[None])
+    log_prob, _ = log_prob_and_entropy(policy, take(obs, th.arange(1)), action[None])
+    gradient = flat(th.autograd.grad(log_prob.sum(), parameters))
+    theta = th.nn.utils.parameters_to_vector(parameters).detach()
+    # To first order, log π(a|s) rises by this much
+    step = 0.3 * gradient / gradient.square().sum().clamp(min=1e-12)
+    results, seed = [], int(th.randint(2**31, ()))
+    for values in (theta, theta + step):
+        th.nn.utils.vector_to_parameters(values, parameters)
+        with th.random.fork_rng(devices=[]), th.no_grad():
+            th.manual_seed(seed)
+            results.append(closeness(policy, flat_actions(policy, policy(obs)[0]), action))
+    th.nn.utils.vector_to_parameters(theta, parameters)
+    return results[0], results[1]
+
+
+def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: float, lam: float) -> np.ndarray:
+    """
+    ``G_t = (1 − λ) Σ_{n=1}^{N−1} λ^{n−1} G_{t:t+n} + λ^{N−1} G_{t:t+N}``, ``G_{t:t+n} = Σ_{k<n} γ^k r_{t+k} + γ^n V``.
+
+    Source: Sutton and Barto (2018), equations 12.1 and 12.3, term by term and not by a recursion.
+
+    :param rewards: Rewards of one episode, shape ``(T,)``
+    :param next_values: V(s_{t+1}), shape ``(T,)``
+    :param gamma: γ
+    :param lam: λ
+    :return: Shape ``(T,)``
+    """
+    returns = np.zeros(len(rewards))
+    for t in range(len(rewards)):
+        n = np.arange(1, len(rewards) - t + 1)
+        n_step = np.cumsum(gamma ** (n - 1) * rewards[t:]) + gamma**n * next_values[t:]
+        shares = np.where(n < n[-1], (1 - lam) * lam ** (n - 1.0), lam ** (n - 1.0))
+        returns[t] = shares @ n_step
+    return returns
+
+
+def return_error(sampler: REINFORCE, rollout: Rollout, infos: Infos) -> float:
+    """
+    The largest difference of a return from its definition, by the largest return.
+
+    :param sampler: The model that collected
+    :param rollout: What it collected
+    :param infos: The infos of its steps
+    """
+    error, scale = 0.0, 1e-12
+    for episode in th.unique(rollout.episodes[rollout.used]):
+        steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
+        values = np.zeros(len(steps))
+        if rollout.values is not None:
+            values[:-1] = rollout.values[steps, envs][1:]
+            info = infos.infos[int(steps[-1])][int(envs[-1])]
+            if info.get("TimeLimit.truncated"):
+                terminal = obs_as_tensor(stack([info["terminal_observation"]]), sampler.device)
+                with th.no_grad():
+                    values[-1] = float(sampler.policy.predict_values(terminal))
+        rewards = rollout.rewards[steps, envs].numpy()
+        expected = return_by_definition(rewards, values, sampler.gamma, sampler.gae_lambda)
+        if not sampler.reward_to_go:
+            expected[:] = expected[0]
+        error = max(error, float(np.abs(rollout.returns[steps, envs].numpy() - expected).max()))
+        scale = max(scale, float(np.abs(expected).max()))
+    return error / scale
+
+
+def weight_error(sampler: REINFORCE, rollout: Rollout) -> float:
+    """
+    ``‖w − (G − b)‖ / ‖w‖`` over the used steps, w being what training reads from the rollout buffer.
+
+    :param sampler: The model that collected
+    :param rollout: What it collected
+    """
+    expected = (rollout.returns - sampler._weighing.baseline(rollout).cpu()) * rollout.used
+    weights = th.as_tensor(by_step(sampler.rollout_buffer, sampler.rollout_buffer.advantages)).double()
+    return relative(weights, expected)
+
+
+def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
+    """
+    The step of ``train()`` at rate 1, without entropy bonus, normalization and clipping, against
+    ``Σ w_t γ^t ∇ log π / denominator``.
+
+    :param sampler: The model that collected; its policy is trained
+    :param rollout: What it collected
+    """
+    weights = th.as_tensor(by_step(sampler.rollout_buffer, sampler.rollout_buffer.advantages)).double()
+    expected = gradients_by_episode(rollout, weights * rollout.discounts)[0].sum(0) / sampler._denominator(rollout)
+    obs = take(select(rollout.observations, rollout.used), th.arange(1))
+    actions = as_policy_actions(select(rollout.actions, rollout.used)[:1], sampler.action_space)
+    parameters: Parameters = score_parameters(sampler.policy, obs, actions)
+    before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
+    sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=1.0)
+    sampler.lr_schedule = FloatSchedule(1.0)
+    sampler.ent_coef, sampler.vf_coef, sampler.max_grad_norm, sampler.min_std = 0.0, 0.0, None, 0.0  # type: ignore[assignment]
+    sampler.critic_learning_rate, sampler.normalize_advantage, sampler._sorted_parameters = 0.0, False, ()
+    sampler._make_critic_optimizer()
+    sampler.train()
+    return relative(th.nn.utils.parameters_to_vector(parameters).detach() - before, expected)

@@ -1,0 +1,184 @@
+"""The gradient check passes where the gradient is right, and names the line where it is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor, Tree
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.check_errors import return_by_definition
+from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.returns import lambda_return
+
+ACTION_SPACES = [
+    spaces.Discrete(3),
+    spaces.Discrete(3, start=4),
+    spaces.Box(-1, 1, (2,)),
+    spaces.MultiDiscrete([2, 3]),
+    spaces.MultiBinary(2),
+]
+
+
+def corridor(action_space=None):
+    """Time limits, rewards that differ, and episodes of two lengths."""
+    return Corridor((3, 7), lambda t, action: 1.0 + t + np.sum(action), action_space=action_space, truncate=True)
+
+
+@pytest.mark.parametrize("action_space", ACTION_SPACES)
+@pytest.mark.parametrize(
+    "kwargs", [{}, {"gae_lambda": 0.7}, {"baseline": "optimal"}, {"baseline": "mean", "reward_to_go": False}]
+)
+def test_every_action_space_passes(action_space, kwargs):
+    env = make_vec_env(lambda: corridor(action_space), 2, seed=0)
+    table = check_gradient(REINFORCE("MlpPolicy", env, device="cpu", seed=0, gamma=0.9, **kwargs))
+    assert table.passed, table
+    assert table.names == ["log_prob", "scores", "sign", "returns", "weights", "surrogate"]
+
+
+@pytest.mark.parametrize(
+    ("policy", "env", "kwargs"),
+    [
+        ("MlpPolicy", "CartPole-v1", {"normalize_advantage": True, "discount_scores": True, "ent_coef": 0.1}),
+        ("MlpPolicy", "CartPole-v1", {"temperature": 0.5, "n_episodes": 3, "normalize_by": "episodes"}),
+        ("MultiInputPolicy", SimpleMultiObsEnv(random_start=False), {"n_episodes": 2}),
+    ],
+)
+def test_other_policies_and_arguments_pass(policy, env, kwargs):
+    table = check_gradient(REINFORCE(policy, env, device="cpu", seed=0, **kwargs))
+    assert table.passed, table
+
+
+def test_gsde_cuts_its_scores_unless_it_learns_features():
+    """Stable-Baselines3 detaches the features that the standard deviation depends on: not the gradient of log π."""
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, device="cpu", seed=0)
+    assert check_gradient(model).failures == ["scores"]
+    model.policy.action_dist.learn_features = True
+    assert check_gradient(model).passed
+
+
+def test_a_trained_model_passes_and_is_as_it_was():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", seed=0).learn(3000)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    optimizer, steps = model.policy.optimizer, model.num_timesteps
+    table = check_gradient(model)
+    assert table.passed, table
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+    assert model.policy.optimizer is optimizer
+    assert (model.num_timesteps, model.max_grad_norm, model.n_steps) == (steps, 0.5, 32)
+    model.learn(64, reset_num_timesteps=False)
+
+
+class Negated(ActorCriticPolicy):
+    """Returns −log π, as if for a loss."""
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, -log_prob, entropy
+
+
+class Shifted(ActorCriticPolicy):
+    """Evaluates the next action instead of the one that was taken."""
+
+    def evaluate_actions(self, obs, actions):
+        return super().evaluate_actions(obs, (actions + 1) % 3)
+
+
+class Offset(ActorCriticPolicy):
+    """Adds a constant per action to log π, which no longer is a log-probability."""
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob + 0.1 * actions, entropy
+
+
+class HalfDetached(ActorCriticPolicy):
+    """Cuts the graph between the network and the logits' layer."""
+
+    def evaluate_actions(self, obs, actions):
+        latent = self.mlp_extractor.forward_actor(self.extract_features(obs)).detach()
+        distribution = self._get_action_dist_from_latent(latent)
+        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+
+
+class WrongReturns(REINFORCE):
+    """Forgets the discount factor of what is still to come."""
+
+    def collect_rollouts(self, *args, **kwargs):
+        going_on = super().collect_rollouts(*args, **kwargs)
+        self._rollout = replace(self._rollout, returns=self._rollout.returns + self._rollout.rewards)
+        return going_on
+
+
+class WrongWeights(REINFORCE):
+    """Scales the weights on their way to training."""
+
+    def collect_rollouts(self, env, callback, rollout_buffer, n_rollout_steps):
+        going_on = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        rollout_buffer.advantages *= 1.1
+        return going_on
+
+
+class TwoSteps(REINFORCE):
+    """Takes a second step from the same data."""
+
+    def train(self):
+        super().train()
+        super().train()
+
+
+def failures(algorithm=REINFORCE, policy="MlpPolicy"):
+    model = algorithm(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
+    with th.no_grad():
+        # A policy that is far from uniform
+        model.policy.action_net.weight.mul_(100)
+    return check_gradient(model).failures
+
+
+@pytest.mark.parametrize(
+    ("wrong", "lines"),
+    [
+        ({"policy": Negated}, ["log_prob", "sign"]),
+        ({"policy": Shifted}, ["log_prob", "sign"]),
+        ({"policy": Offset}, ["log_prob"]),
+        ({"policy": HalfDetached}, ["scores"]),
+        ({"algorithm": WrongReturns}, ["returns", "weights"]),
+        ({"algorithm": WrongWeights}, ["weights"]),
+        ({"algorithm": TwoSteps}, ["surrogate"]),
+    ],
+)
+def test_what_is_wrong_is_named(wrong, lines):
+    assert failures(**wrong) == lines
+
+
+def test_negation_is_seen_in_every_action_space():
+    for action_space in ACTION_SPACES:
+        model = REINFORCE(Negated, corridor(action_space), baseline="none", device="cpu", seed=0)
+        assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
+
+
+def test_returns_by_definition_are_the_recursive_ones():
+    rewards, values, dones = np.random.randn(9), np.random.randn(9), np.arange(9) == 8
+    for gamma, lam in ((0.9, 0.7), (1.0, 1.0), (0.5, 0.0)):
+        recursive = lambda_return(rewards[:, None], dones[:, None], values[:, None], gamma, lam)[:, 0]
+        np.testing.assert_allclose(return_by_definition(rewards, values, gamma, lam), recursive, rtol=1e-12)
+
+
+class Detached(ActorCriticPolicy):
+    @th.no_grad()
+    def evaluate_actions(self, obs, actions):
+        return super().evaluate_actions(obs, actions)
+
+
+def test_a_users_mistake_is_named():
+    with pytest.raises(ValueError, match="n_episodes must be at least 2"):
+        check_gradient(REINFORCE("MlpPolicy", Tree(), device="cpu"), n_episodes=1)
+    with pytest.raises(TypeError, match="must be a REINFORCE"):
+        check_gradient("CartPole-v1")
+    with pytest.raises(ValueError, match="Detached cannot be differentiated"):
+        check_gradient(REINFORCE(Detached, Tree(), device="cpu", baseline="none"))
