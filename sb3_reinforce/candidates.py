@@ -18,7 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_reinforce.actors import Actor
+from sb3_reinforce.actors import MatrixActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -46,16 +46,58 @@ class Slots:
     """
     The pair that each environment is busy with, and what it has seen of it.
 
+    Kept so that a step in which no episode ends costs next to nothing.
+
     :param queue: The pairs to work off
     :param n_envs: Number of environments
+    :param max_episode_steps: The length beyond which an episode counts as one that never ends
     """
 
-    def __init__(self, queue: list[Pair], n_envs: int):
+    def __init__(self, queue: list[Pair], n_envs: int, max_episode_steps: int):
         self.waiting = queue[n_envs:]
         self.pairs = queue[:n_envs]
         self.active = np.arange(n_envs) < len(self.pairs)
+        self.n_active = len(self.pairs)
         self.totals = np.zeros(n_envs)
-        self.lengths = np.zeros(n_envs, dtype=int)
+        self.clock, self.begun = 0, np.zeros(n_envs, dtype=int)
+        self.max_episode_steps = self.deadline = max_episode_steps
+
+    def add(self, rewards: np.ndarray, obs: Any) -> None:
+        """
+        Take in a step.
+
+        :param rewards: Shape ``(n_envs,)``
+        :param obs: The observations after it
+        :raises ValueError: Naming the first candidate, episode and step where a number is not finite, or the ones of an
+            episode that does not end
+        """
+        self.totals += rewards
+        self.check("The reward", rewards)
+        for key, part in obs.items() if isinstance(obs, dict) else (("", obs),):
+            if part.dtype.kind == "f":
+                self.check(f"The observation {key!r}" if key else "The observation", part)
+        self.clock += 1
+        if self.clock > self.deadline:
+            late = int(np.argmax(self.active & (self.begun + self.max_episode_steps == self.deadline)))
+            raise ValueError(
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps "
+                f"({self.describe(late)}): give the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
+            )
+
+    def check(self, name: str, values: np.ndarray) -> None:
+        """
+        Check numbers that came from the environments.
+
+        :param name: What they are, for the message
+        :param values: Shape ``(n_envs, ...)``
+        :raises ValueError: As ``add``
+        """
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        bad = ~finite.reshape(len(values), -1).all(1) & self.active
+        for i in np.flatnonzero(bad).tolist():
+            raise ValueError(f"{name} of {self.describe(i)} is not finite: {values[i]}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """
@@ -68,53 +110,28 @@ class Slots:
         begun = []
         for i in np.flatnonzero(finished).tolist():
             returns[self.pairs[i]] = self.totals[i]
-            self.totals[i] = self.lengths[i] = 0
+            self.totals[i], self.begun[i] = 0, self.clock
             if self.waiting:
                 self.pairs[i] = self.waiting.pop(0)
                 begun.append(i)
             else:
                 # The environment acts on as it last did; its steps are counted and not used
                 self.active[i] = False
+                self.n_active -= 1
+        self.deadline = self.max_episode_steps + int(self.begun[self.active].min(initial=self.clock))
         return begun
-
-    def check(self, name: str, values: np.ndarray) -> None:
-        """
-        Check numbers that came from the environments.
-
-        :param name: What they are, for the message
-        :param values: Shape ``(n_envs, ...)``
-        :raises ValueError: Naming the first candidate, episode and step where one is not finite
-        """
-        if np.isfinite(values).all():
-            return
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(1) & self.active
-        for i in np.flatnonzero(bad).tolist():
-            raise ValueError(f"{name} of {self.describe(i)} is not finite: {values[i]}. {UNCHANGED}")
-
-    def check_length(self, max_episode_steps: int) -> None:
-        """
-        Check that no episode goes on for ever.
-
-        :param max_episode_steps: The length at which one counts as doing so
-        :raises ValueError: Naming the candidate and the episode
-        """
-        for i in np.flatnonzero(self.active & (self.lengths >= max_episode_steps)).tolist():
-            raise ValueError(
-                f"An episode has not ended after max_episode_steps={max_episode_steps} steps ({self.describe(i)}): give "
-                f"the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
-            )
 
     def describe(self, env: int) -> str:
         """Where an environment is, for a message."""
         candidate, episode = self.pairs[env]
-        return f"candidate {candidate}, episode {episode}, step {self.lengths[env] - 1} (environment {env})"
+        return f"candidate {candidate}, episode {episode}, step {self.clock - self.begun[env]} (environment {env})"
 
 
 UNCHANGED = "The policy is the one before this update."
 
 
 def evaluate(
-    actor: Actor,
+    actor: MatrixActor,
     env: VecEnv,
     thetas: th.Tensor,
     seeds: np.ndarray | None,
@@ -140,23 +157,20 @@ def evaluate(
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))
     for queue in queues(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
-        slots = Slots(queue, env.num_envs)
+        slots = Slots(queue, env.num_envs, max_episode_steps)
         obs = start(env, slots.pairs, seeds)
         begun = list(range(len(slots.pairs)))
-        while slots.active.any():
+        while slots.n_active:
             if begun:
                 actor.assign(begun, thetas[[slots.pairs[i][0] for i in begun]])
+                begun = []
             new_obs, rewards, dones, infos = env.step(actor.act(obs))
-            obs, utilities = new_obs, rewards if original is None else original()
-            slots.totals += utilities
-            slots.lengths += 1
-            slots.check("The reward", utilities)
-            for name, part in float_parts(new_obs):
-                slots.check(name, part)
+            obs = new_obs
+            slots.add(rewards if original is None else original(), new_obs)
             finished = dones & slots.active
             on_step(Step(new_obs, rewards, dones, infos, finished))
-            begun = slots.finish(finished, returns) if finished.any() else []
-            slots.check_length(max_episode_steps)
+            if finished.any():
+                begun = slots.finish(finished, returns)
     return returns
 
 
@@ -200,14 +214,3 @@ def start(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> Any:
                     f"{type(env.unwrapped).__name__} does not have: set common_random_numbers=False"
                 ) from error
     return env.reset()
-
-
-def float_parts(obs: Any) -> list[tuple[str, np.ndarray]]:
-    """
-    The parts of an observation that can be other than finite, with names for messages.
-
-    :param obs: An array, or a dict of arrays
-    """
-    if isinstance(obs, dict):
-        return [(f"The observation {key!r}", part) for key, part in obs.items() if part.dtype.kind == "f"]
-    return [("The observation", obs)] if obs.dtype.kind == "f" else []

@@ -35,9 +35,7 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     return solve(deltas, utilities[1:] - utilities[0])
 
 
-def central_difference(
-    utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_top: int | None = None
-) -> th.Tensor:
+def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_top: int | None = None) -> th.Tensor:
     """
     ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, exact on quadratic utilities, error of order 2 in ‖Δ‖.
 
@@ -101,7 +99,8 @@ def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
     :param differences: Shape ``(k,)``
     :return: ĝ, shape ``(n,)``
     """
-    return th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
+    gradient: th.Tensor = th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
+    return gradient
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,8 @@ def fit_quality(deltas: th.Tensor, utilities: th.Tensor, gradient: th.Tensor) ->
     """
     x, y = deltas - deltas.mean(0), utilities - utilities.mean()
     residuals = y - x @ gradient
-    rank = int(th.linalg.matrix_rank(x))
+    # Of the smaller of the two products: they have the same rank, and n may be large
+    rank = int(th.linalg.matrix_rank(x @ x.T if len(x) < len(gradient) else x.T @ x, hermitian=True))
     degrees_of_freedom = len(y) - 1 - rank
     squares, total = float(residuals @ residuals), float(y @ y)
     residual_std = (squares / degrees_of_freedom) ** 0.5 if degrees_of_freedom > 0 else float("nan")

@@ -244,7 +244,7 @@ class FiniteDifference(BaseAlgorithm):
             self._warned = True
             warnings.warn(
                 f"n_delta={n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters and "
-                "an intercept: the regression returns the one of least norm. estimator='central' is less biased then",
+                "an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
                 stacklevel=3,
             )
 

@@ -19,7 +19,9 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     log_std = getattr(policy, "log_std", None)
     parameters = [parameter for parameter in split_parameters(policy)[0] if parameter is not log_std]
     if not parameters:
-        raise ValueError(f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search")
+        raise ValueError(
+            f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"
+        )
     return parameters
 
 
@@ -41,7 +43,7 @@ def split(thetas: th.Tensor, parameters: Sequence[th.Tensor]) -> list[th.Tensor]
     :param parameters: Tensors with n elements in all
     :return: For each parameter a tensor of shape ``(k, *parameter.shape)``
     """
-    parts = thetas.split([parameter.numel() for parameter in parameters], dim=1)
+    parts = th.split(thetas, [parameter.numel() for parameter in parameters], dim=1)
     return [
         part.reshape(-1, *parameter.shape).to(parameter.device, parameter.dtype)
         for part, parameter in zip(parts, parameters, strict=True)

@@ -42,7 +42,9 @@ def sphere(k: int, n: int, generator: th.Generator) -> th.Tensor:
     :param generator: Source of randomness
     :return: Shape ``(k, n)``, every row of norm √n
     """
-    return n**0.5 * th.nn.functional.normalize(gaussian(k, n, generator))
+    deltas = gaussian(k, n, generator)
+    norms: th.Tensor = th.linalg.vector_norm(deltas, dim=1, keepdim=True)
+    return deltas * (n**0.5 / norms)
 
 
 def gaussian(k: int, n: int, generator: th.Generator) -> th.Tensor:

@@ -34,7 +34,7 @@ def check_finite_difference(model: Any) -> None:
         if model.estimator != "central":
             raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
         if model.n_delta is None or model.n_top > model.n_delta:
-            raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least as many, got n_delta={model.n_delta!r}")
+            raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
     check_integer("n_eval_episodes", model.n_eval_episodes, 1)
     check_integer("max_episode_steps", model.max_episode_steps, 1)
     if model.max_grad_norm is not None:
