@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_reinforce.actors import MatrixActor
+from sb3_reinforce.workers import step
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -153,6 +154,7 @@ def evaluate(
     :param vec_normalize: Where it scales rewards, returns are sums of the rewards before that: its scale drifts
     :return: Shape ``(m, n_episodes)``, float64
     :raises ValueError: If a reward or observation is not finite, an episode does not end, or seeds cannot be set
+    :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))
@@ -164,7 +166,7 @@ def evaluate(
             if begun:
                 actor.assign(begun, thetas[[slots.pairs[i][0] for i in begun]])
                 begun = []
-            new_obs, rewards, dones, infos = env.step(actor.act(obs))
+            new_obs, rewards, dones, infos = step(env, actor.act(obs))
             obs = new_obs
             slots.add(rewards if original is None else original(), new_obs)
             finished = dones & slots.active

@@ -31,6 +31,7 @@ from sb3_reinforce.linear_policy import LinearPolicy
 from sb3_reinforce.normalization import frozen
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.search_settings import (
+    check_candidates,
     check_deltas,
     check_finite_difference,
     check_gradient,
@@ -68,7 +69,7 @@ class FiniteDifference(BaseAlgorithm):
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param estimator: ``"regression"``, ``"central"``, ``"forward"``, or a function of a utility, θ of shape ``(n,)``
         and perturbations of shape ``(k, n)`` that returns a gradient of shape ``(n,)``
-    :param perturbation: ``"sphere"``, ``"gaussian"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
+    :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
         ``torch.Generator`` that returns a tensor of shape ``(k, n)``
     :param n_delta: k, the perturbations per update. None: 2n for the regression, n for the others, but at most 64
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
@@ -107,7 +108,7 @@ class FiniteDifference(BaseAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule = 0.05,
         estimator: str | Estimator = "regression",
-        perturbation: str | Perturbation = "sphere",
+        perturbation: str | Perturbation = "gaussian",
         n_delta: int | None = None,
         delta_std: float | Schedule | None = None,
         n_eval_episodes: int = 1,
@@ -294,7 +295,7 @@ class FiniteDifference(BaseAlgorithm):
         :param candidates: Shape ``(k, n)``, or ``(m, k, n)`` where only candidates of one column are compared
         :return: Shape ``(k,)`` or ``(m, k)``, float64
         """
-        thetas = candidates.reshape(-1, self.n_parameters)
+        thetas = check_candidates(candidates, self.n_parameters).reshape(-1, self.n_parameters)
         columns = np.arange(len(thetas)) % candidates.shape[1] if candidates.dim() == 3 else np.zeros(len(thetas), int)
         episodes = np.arange(self.n_eval_episodes)
         seeds = (first_seed + columns[:, None] * self.n_eval_episodes + episodes) % 2**31

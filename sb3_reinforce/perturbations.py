@@ -5,6 +5,7 @@ The random ones have unit standard deviation in every component, ``E[δ δᵀ] =
 deviation of what is added to a parameter, as in ARS, whichever of them is used.
 """
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -44,7 +45,7 @@ def sphere(k: int, n: int, generator: th.Generator) -> th.Tensor:
     """
     deltas = gaussian(k, n, generator)
     norms: th.Tensor = th.linalg.vector_norm(deltas, dim=1, keepdim=True)
-    return deltas * (n**0.5 / norms)
+    return math.sqrt(n) * deltas / norms
 
 
 def gaussian(k: int, n: int, generator: th.Generator) -> th.Tensor:

@@ -86,6 +86,24 @@ def check_gradient(gradient: Any, n_parameters: int) -> th.Tensor:
     return _check_tensor("estimator", gradient, (n_parameters,))
 
 
+def check_candidates(candidates: Any, n_parameters: int) -> th.Tensor:
+    """
+    Check what an estimator asks the utility of.
+
+    :param candidates: What it asks it of
+    :param n_parameters: n
+    :return: Shape ``(k, n)`` or ``(m, k, n)``
+    :raises ValueError: If it is not a finite tensor of one of these shapes
+    """
+    if not isinstance(candidates, th.Tensor) or candidates.dim() not in (2, 3) or candidates.shape[-1] != n_parameters:
+        got = tuple(candidates.shape) if isinstance(candidates, th.Tensor) else candidates
+        raise ValueError(
+            f"candidates must be a tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), but the estimator "
+            f"called the utility with {got}"
+        )
+    return _check_tensor("estimator", candidates, tuple(candidates.shape))
+
+
 def _check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:
     if not isinstance(value, th.Tensor) or value.shape != shape:
         got = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, th.Tensor) else repr(value)
