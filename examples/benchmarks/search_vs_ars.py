@@ -24,7 +24,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_reinforce import FiniteDifference
 
 RESULTS = Path(__file__).parent / "results" / "search_vs_ars.csv"
-SMALL_NET = dict(net_arch=dict(pi=[16], vf=[]))
 # rl_zoo3 2.9.2, hyperparams/ars.yml; the entry of Swimmer-v5 is that of Swimmer-v4
 ZOO_MLP = dict(
     policy="MlpPolicy", learning_rate=0.018, n_delta=4, n_top=1, delta_std=0.1, zero_policy=False,
@@ -36,16 +35,23 @@ ZOO: dict[str, dict[str, Any]] = {
     "MountainCarContinuous-v0": {**ZOO_MLP, "delta_std": 0.2},
     "Swimmer-v5": dict(policy="LinearPolicy", learning_rate=0.02, delta_std=0.01, n_delta=1, n_top=1),
 }
+MLP = dict(
+    policy="MlpPolicy", learning_rate=0.02, estimator="central", n_delta=4, delta_std=0.1,
+    policy_kwargs=dict(net_arch=dict(pi=[16], vf=[]), activation_fn=th.nn.ReLU, ortho_init=False),
+)  # fmt: skip
 OURS: dict[str, dict[str, Any]] = {
     "CartPole-v1": dict(policy="LinearPolicy"),
-    "Pendulum-v1": dict(policy="MlpPolicy", estimator="central", n_delta=16, delta_std=0.1, learning_rate=0.02,
-                        policy_kwargs=SMALL_NET),
-    "MountainCarContinuous-v0": dict(policy="LinearPolicy", delta_std=0.5, learning_rate=0.1),
-    "Swimmer-v5": dict(policy="LinearPolicy", estimator="central", n_delta=4, learning_rate=0.05),
+    "Pendulum-v1": MLP,
+    "MountainCarContinuous-v0": {
+        **MLP, "n_top": 1, "delta_std": 0.2, "policy_kwargs": dict(net_arch=dict(pi=[16], vf=[])),
+    },
+    "Swimmer-v5": dict(policy="LinearPolicy", learning_rate=0.02, estimator="central", n_delta=2, delta_std=0.05),
 }  # fmt: skip
+# As many as there are candidates, so that none idles, but for CartPole, whose episodes differ most in length
+N_ENVS = {"CartPole-v1": 1, "Pendulum-v1": 8, "MountainCarContinuous-v0": 8, "Swimmer-v5": 4}
 NORMALIZE = {"Pendulum-v1", "MountainCarContinuous-v0"}
 TIMESTEPS = {
-    "CartPole-v1": 50_000, "Pendulum-v1": 1_000_000, "MountainCarContinuous-v0": 300_000, "Swimmer-v5": 500_000,
+    "CartPole-v1": 50_000, "Pendulum-v1": 1_000_000, "MountainCarContinuous-v0": 300_000, "Swimmer-v5": 300_000,
 }  # fmt: skip
 
 
@@ -97,9 +103,12 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     timesteps = arguments.timesteps or TIMESTEPS[arguments.env]
+    own_n_envs = N_ENVS[arguments.env]
     for seed in arguments.seeds:
         for name in arguments.algo:
-            algorithm, settings, n_envs = (ARS, ZOO, 1) if name == "ARS" else (FiniteDifference, OURS, 8)
+            algorithm, settings, n_envs = (
+                (ARS, ZOO, 1) if name == "ARS" else (FiniteDifference, OURS, N_ENVS[arguments.env])
+            )
             env = make(arguments.env, n_envs, seed)
             model = algorithm(env=env, seed=seed, device="cpu", **settings[arguments.env])
             Counted.steps, callback = 0, LastWithin(timesteps)
