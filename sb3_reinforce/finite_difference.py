@@ -279,6 +279,8 @@ class FiniteDifference(BaseAlgorithm):
         try:
             with frozen(self._vec_normalize_env) as self._observed:
                 gradient = check_gradient(estimator(utility, theta, deltas), len(theta))
+                if not self._utilities:
+                    raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:
             # The environments are in the middle of episodes, and are reset before they are used again
             self._last_obs = None

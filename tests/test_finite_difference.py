@@ -285,9 +285,8 @@ def test_utilities_are_sums_of_rewards_before_their_scaling() -> None:
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_policies(policy: str, env: Any, deterministic: bool) -> None:
     model = make(make_vec_env(env, 2), policy, n_delta=1, deterministic=deterministic)
-    theta = model.theta
     model.learn(2)
-    assert theta.shape == (model.n_parameters,) and not th.equal(model.theta, theta) or model._n_updates
+    assert model._n_updates == 1 and model.theta.shape == (model.n_parameters,)
     assert np.isfinite(evaluate_policy(model, model.get_env(), 1)[0])
 
 
@@ -390,6 +389,7 @@ def test_unsupported_spaces_are_an_error(space: spaces.Space) -> None:
         (dict(estimator=lambda u, t, d: t[:1]), r"estimator must return a tensor of shape \(8,\), got .*\(1,\)"),
         (dict(estimator=lambda u, t, d: 3.0), r"estimator must return a tensor of shape \(8,\), got 3.0"),
         (dict(estimator=lambda u, t, d: t * np.nan), "estimator must return finite numbers"),
+        (dict(estimator=lambda u, t, d: t), "estimator must call the utility at least once"),
         (dict(estimator=lambda u, t, d: u(t)), r"candidates must be a tensor of shape \(k, 8\) or \(m, k, 8\)"),
         (dict(perturbation=lambda k, n, g: th.ones(n, k)), r"perturbation must return a tensor of shape \(3, 8\)"),
         (dict(perturbation=lambda k, n, g: th.full((k, n), th.inf)), "perturbation must return finite numbers"),

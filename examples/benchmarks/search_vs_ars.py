@@ -103,7 +103,6 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     timesteps = arguments.timesteps or TIMESTEPS[arguments.env]
-    own_n_envs = N_ENVS[arguments.env]
     for seed in arguments.seeds:
         for name in arguments.algo:
             algorithm, settings, n_envs = (
