@@ -21,6 +21,7 @@ from sb3_reinforce.actors import make_actor
 from sb3_reinforce.arguments import check_finite
 from sb3_reinforce.returns import Bools
 from sb3_reinforce.rollouts import Extent
+from sb3_reinforce.workers import stepper
 
 # The arrays of a RolloutBuffer that have one row per step
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -56,9 +57,10 @@ def collect(
     :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
     :return: How the episodes ended; None if the callback stopped the collection
     :raises ValueError: If an episode that is waited for does not end
+    :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs), 0
-    as_env_actions = env_actions_of(policy)
+    as_env_actions, step = env_actions_of(policy), stepper(env)
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
@@ -82,7 +84,7 @@ def collect(
             write(rollout_buffer.log_probs, n_steps, log_probs)
 
         clipped_actions = as_env_actions(actions)
-        new_obs, rewards, dones, infos = env.step(clipped_actions)
+        new_obs, rewards, dones, infos = step(clipped_actions)
         model.num_timesteps += env.num_envs
         model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
 

@@ -1,5 +1,7 @@
 """Stepping environments in other processes without waiting for ever for one that has died."""
 
+from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -28,6 +30,15 @@ def step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
         wait([remote, process.sentinel])
     check_alive(workers)
     return env.step_wait()
+
+
+def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
+    """
+    How to step an environment: as ``step`` where it has workers, else by its own ``step``, which costs nothing more.
+
+    :param env: The environments
+    """
+    return partial(step, env) if isinstance(env.unwrapped, SubprocVecEnv) else env.step
 
 
 def check_alive(workers: SubprocVecEnv) -> None:
