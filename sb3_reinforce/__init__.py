@@ -1,7 +1,8 @@
 """REINFORCE and finite-difference policy search as algorithms of Stable-Baselines3."""
 
+from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.reinforce import REINFORCE
 
 __version__ = "0.1.0"
 
-__all__ = ["REINFORCE", "__version__"]
+__all__ = ["REINFORCE", "FiniteDifference", "__version__"]

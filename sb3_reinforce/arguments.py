@@ -137,8 +137,13 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
     for key, space in parts.items():
+        where = f" under {key!r}" if key else ""
+        if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+            raise ValueError(
+                f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
+                f"got {space}"
+            )
         if np.any(getattr(space, "start", 0)):
-            where = f" under {key!r}" if key else ""
             raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
 
 

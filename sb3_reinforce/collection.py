@@ -5,6 +5,7 @@ It stands apart from ``rollouts``, which holds what was collected and the pure f
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from sb3_reinforce.actors import make_actor
 from sb3_reinforce.arguments import check_finite
 from sb3_reinforce.returns import Bools
 from sb3_reinforce.rollouts import Extent
+from sb3_reinforce.workers import stepper
 
 # The arrays of a RolloutBuffer that have one row per step
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
@@ -55,13 +57,15 @@ def collect(
     :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
     :return: How the episodes ended; None if the callback stopped the collection
     :raises ValueError: If an episode that is waited for does not end
+    :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs), 0
+    as_env_actions, step = env_actions_of(policy), stepper(env)
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
-    deadline = extent.max_episode_steps
-    while n_steps < extent.n_steps and owed.any():
+    deadline, waiting = extent.max_episode_steps, True
+    while n_steps < extent.n_steps and waiting:
         if n_steps == deadline:
             raise ValueError(
                 f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole "
@@ -74,13 +78,13 @@ def collect(
         actions, values, log_probs = actor.act(model._last_obs)
         write(rollout_buffer.observations, n_steps, model._last_obs)
         write(rollout_buffer.actions, n_steps, actions)
-        write(rollout_buffer.episode_starts, n_steps, model._last_episode_starts)
+        rollout_buffer.episode_starts[n_steps] = model._last_episode_starts
         if values is not None and log_probs is not None:
             write(rollout_buffer.values, n_steps, values)
             write(rollout_buffer.log_probs, n_steps, log_probs)
 
-        clipped_actions = as_env_actions(policy, actions)
-        new_obs, rewards, dones, infos = env.step(clipped_actions)
+        clipped_actions = as_env_actions(actions)
+        new_obs, rewards, dones, infos = step(clipped_actions)
         model.num_timesteps += env.num_envs
         model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
 
@@ -88,9 +92,9 @@ def collect(
         if not callback.on_step():
             return None
         # After the callback, which may have changed the rewards in place; some VecEnvs reuse the array of the dones
-        write(rollout_buffer.rewards, n_steps, rewards)
+        rollout_buffer.rewards[n_steps] = rewards
         all_dones.append(dones.astype(bool))
-        if dones.any():
+        if np.count_nonzero(dones):
             wanted = np.flatnonzero(all_dones[-1] & (owed > 0))
             model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
             for i in wanted:
@@ -98,7 +102,7 @@ def collect(
                     terminal_obs[n_steps, int(i)] = infos[i]["terminal_observation"]
             owed[wanted] -= 1
             begun[wanted] = n_steps + 1
-            deadline = extent.max_episode_steps + min(begun[owed > 0], default=0)
+            deadline, waiting = extent.max_episode_steps + min(begun[owed > 0], default=0), bool(owed.any())
         rollout_buffer.pos = n_steps = n_steps + 1
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
@@ -108,18 +112,20 @@ def collect(
     return Ends(np.stack(all_dones), terminal_obs)
 
 
-def as_env_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
+def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarray]:
     """
-    The policy's actions as the environment takes them: clipped or unscaled to a Box, shifted to a discrete start.
+    How the policy's actions become those of the environment: clipped or unscaled to a Box, shifted to a discrete start.
 
     :param policy: The policy
-    :param actions: Shape ``(n_envs, *action_space.shape)``
-    :return: The same shape
+    :return: A function of actions of shape ``(n_envs, *action_space.shape)``
     """
     space = policy.action_space
     if isinstance(space, spaces.Box):
-        return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
-    return shift_to_start(space, actions)
+        low, high = space.low, space.high
+        return policy.unscale_action if policy.squash_output else lambda actions: np.clip(actions, low, high)
+    if np.any(getattr(space, "start", 0)):
+        return lambda actions: shift_to_start(space, actions)
+    return lambda actions: actions
 
 
 def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:

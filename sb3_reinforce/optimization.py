@@ -38,7 +38,6 @@ def step(
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient if gradient is None or scale == 1 else gradient * scale
     optimizer.step()
-    optimizer.zero_grad()
     return norm
 
 

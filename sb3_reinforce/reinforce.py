@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import (
     BasePolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
@@ -22,19 +22,18 @@ from torch.nn import functional as F
 from sb3_reinforce import optimization
 from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
 from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.collection import by_step, check_data, collect, shift_to_start, warn_of_own_methods
+from sb3_reinforce.collection import check_data, collect, shift_to_start, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
 from sb3_reinforce.policies import (
     Parameters,
-    as_policy_actions,
     floor_std,
     log_prob_and_entropy,
     set_temperature,
     split_parameters,
 )
-from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, select
+from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
 from sb3_reinforce.settings import check_reinforce
-from sb3_reinforce.weighing import Running, Weighing, normalized, weigh
+from sb3_reinforce.weighing import Running, Steps, Weighing, used_steps, weigh
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -232,15 +231,17 @@ class REINFORCE(OnPolicyAlgorithm):
         )
         optimization.fuse(self.critic_optimizer)
 
-    def _sort_parameters(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[Parameters, Parameters, Parameters]:
+    def _sort_parameters(self, steps: Steps) -> tuple[Parameters, Parameters, Parameters]:
         """What log π depends on, what only V depends on, and what both do: found anew where the policy has changed."""
+        if not self.has_critic:
+            return [parameter for parameter in self.policy.parameters() if parameter.requires_grad], [], []
         trainable = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
         if self._sorted_parameters[:1] != (trainable,):
             held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
             if not held >= {number for number, _ in trainable}:
                 self._make_critic_optimizer()
             self.policy.set_training_mode(False)
-            self._sorted_parameters = (trainable, split_parameters(self.policy, obs, actions))
+            self._sorted_parameters = (trainable, split_parameters(self.policy, steps.observations, steps.actions))
         groups: tuple[Parameters, Parameters, Parameters] = self._sorted_parameters[1]
         return groups
 
@@ -314,30 +315,20 @@ class REINFORCE(OnPolicyAlgorithm):
 
         :raises ValueError: If a gradient is not finite; the parameters are those before that step
         """
-        rollout, buffer = cast(Rollout, self._rollout), self.rollout_buffer
-        used = rollout.used
+        rollout = cast(Rollout, self._rollout)
         ent_coef, critic_rate = self._scheduled("ent_coef"), self._critic_rate()
-        obs = select(rollout.observations, used)
-        actions = as_policy_actions(select(rollout.actions, used), self.action_space)
-        targets = select(th.as_tensor(by_step(buffer, buffer.returns), device=self.device), used)
-        weights = select(th.as_tensor(by_step(buffer, buffer.advantages), device=self.device), used)
-        if self.normalize_advantage:
-            weights = normalized(weights)
-        weights = weights * select(rollout.discounts, used).to(weights)
-        actor: Parameters = [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
-        critic: Parameters = []
-        shared: Parameters = []
-        if self.has_critic:
-            actor, critic, shared = self._sort_parameters(obs, actions)
+        steps = used_steps(rollout, self.rollout_buffer, self.normalize_advantage)
+        actor, critic, shared = self._sort_parameters(steps)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
-        log_prob, entropy = log_prob_and_entropy(self.policy, obs, actions)
-        policy_loss = -(weights * log_prob).sum() / self._denominator(rollout)
+        log_prob, entropy = log_prob_and_entropy(self.policy, steps.observations, steps.actions)
+        policy_loss = -(steps.weights * log_prob).sum() / self._denominator(rollout)
         entropy_loss = -entropy.sum() / self._denominator(rollout)
         loss = policy_loss + ent_coef * entropy_loss
         if shared:
-            loss = loss + self.vf_coef * F.mse_loss(self.policy.predict_values(obs).flatten(), targets)
+            values = self.policy.predict_values(steps.observations).flatten()
+            loss = loss + self.vf_coef * F.mse_loss(values, steps.returns)
         gradient = th.autograd.grad(loss, actor, allow_unused=True)
         grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
         floor_std(self.policy, self.min_std)
@@ -353,19 +344,13 @@ class REINFORCE(OnPolicyAlgorithm):
             # Passes that moved the statistics of a shared extractor would be a second step of the policy
             self.policy.set_training_mode(not shared)
             update_learning_rate(self.critic_optimizer, critic_rate)
+            passes = (self.n_critic_updates, self.batch_size, self.max_grad_norm)
             value_loss = fit_critic(
-                self.policy,
-                self.critic_optimizer,
-                critic,
-                obs,
-                targets,
-                self.n_critic_updates,
-                self.batch_size,
-                self.max_grad_norm,
+                self.policy, self.critic_optimizer, critic, steps.observations, steps.returns, *passes
             )
             self.logger.record("train/value_loss", value_loss)
-            values = select(cast(th.Tensor, rollout.values), used).numpy()
-            self.logger.record("train/explained_variance", explained_variance(values, targets.cpu().numpy()))
+            variance = explained_variance(cast(th.Tensor, steps.values).numpy(), steps.returns.cpu().numpy())
+            self.logger.record("train/explained_variance", variance)
 
     def _denominator(self, rollout: Rollout) -> int:
         """The constant ``n_steps * n_envs`` for fixed rollouts, else by ``normalize_by``."""

@@ -8,14 +8,16 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import baselines
 from sb3_reinforce.baselines import Baseline
-from sb3_reinforce.collection import Ends
+from sb3_reinforce.collection import Ends, by_step
 from sb3_reinforce.critic import values_after, values_of
+from sb3_reinforce.policies import as_policy_actions
 from sb3_reinforce.returns import Bools, Floats, Integers, lambda_return, reward_to_go, total_return
-from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, timesteps_of, within_quota
+from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode, select, timesteps_of, within_quota
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,46 @@ def weigh(
     buffer.advantages = ((returns - baseline) * used).astype(np.float32)
     buffer.returns = ((returns_to_go if weighing.has_critic else returns) * used).astype(np.float32)
     return rollout
+
+
+@dataclass(frozen=True)
+class Steps:
+    """
+    The ``n`` used steps of a rollout in a row, as training needs them.
+
+    :param observations: s_t, a tensor of shape ``(n, ...)`` or a dict of such tensors
+    :param actions: a_t as ``evaluate_actions`` takes them
+    :param weights: What each score is multiplied by: γ^t (G_t − b_t), normalized if asked for; float32
+    :param returns: What the critic is fitted to, float32
+    :param values: V(s_t) before the critic is fitted, float64 on the CPU; None without a critic
+    """
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    weights: th.Tensor
+    returns: th.Tensor
+    values: th.Tensor | None
+
+
+def used_steps(rollout: Rollout, buffer: RolloutBuffer, normalize: bool) -> Steps:
+    """
+    Take the used steps, with the advantages and returns of the buffer, which a callback may have changed.
+
+    :param rollout: The rollout
+    :param buffer: The rollout buffer
+    :param normalize: Whether to normalize the advantages
+    """
+    used, device = rollout.used, rollout.actions.device
+    advantages, returns = (
+        select(th.as_tensor(by_step(buffer, rows), device=device), used) for rows in (buffer.advantages, buffer.returns)
+    )
+    return Steps(
+        observations=select(rollout.observations, used),
+        actions=as_policy_actions(select(rollout.actions, used), rollout.policy.action_space),
+        weights=(normalized(advantages) if normalize else advantages) * select(rollout.discounts, used).to(advantages),
+        returns=returns,
+        values=None if rollout.values is None else select(rollout.values, used),
+    )
 
 
 def normalized(weights: th.Tensor) -> th.Tensor:

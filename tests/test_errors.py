@@ -1,5 +1,9 @@
 """A user's mistake gets an error that names the argument, its value and what is allowed, and nothing is lost."""
 
+import os
+import signal
+import threading
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from environments import Corridor
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_reinforce import REINFORCE
 
@@ -290,3 +295,29 @@ def test_mlp_policy_cannot_take_dicts():
 def test_gsde_is_for_box_actions():
     with pytest.raises(ValueError, match="gSDE"):
         REINFORCE("MlpPolicy", gym.make("CartPole-v1"), use_sde=True)
+
+
+@pytest.mark.parametrize("start_method", ["fork", "forkserver"])
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_worker_that_dies_is_named_at_once(start_method, tmp_path):
+    """Also with fork, where the other worker holds its pipe open and a plain step would wait for ever."""
+    env = SubprocVecEnv([lambda: gym.make("CartPole-v1")] * 2, start_method=start_method)
+    model = REINFORCE("MlpPolicy", env, n_steps=8)
+
+    class Kill(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 20:
+                os.kill(env.processes[0].pid, signal.SIGKILL)
+                env.processes[0].join()
+            return True
+
+    # A hang would otherwise hold up the whole test run
+    watchdog = threading.Timer(60, env.processes[1].kill)
+    watchdog.start()
+    with pytest.raises(ConnectionError, match="worker of environment 0 died"):
+        model.learn(10_000, Kill())
+    watchdog.cancel()
+    assert env.processes[1].is_alive() and model._n_updates == 2
+    model.save(tmp_path / "model")
+    env.processes[1].kill()
+    env.closed = True

@@ -1,0 +1,64 @@
+"""
+How much of a gradient's variance is the luck of the start?
+
+    python examples/benchmarks/common_random_numbers.py --env Pendulum-v1
+
+Estimates the gradient at one θ many times, with and without common random numbers, and prints the ratio of the
+variances (traces of the covariances) at the same number of episodes, and that of the steps they took.
+"""
+
+import argparse
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import FiniteDifference
+
+
+class Gradients(BaseCallback):
+    """Collects ĝ of every update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gradients: list[th.Tensor] = []
+
+    def _on_rollout_end(self) -> None:
+        self.gradients.append(self.locals["gradient"])
+
+    def _on_step(self) -> bool:
+        return len(self.gradients) < self.model.n_wanted
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="Pendulum-v1")
+    parser.add_argument("--policy", default="LinearPolicy")
+    parser.add_argument("--n-delta", type=int, default=16)
+    parser.add_argument("--n-gradients", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    print(
+        f"{arguments.env}, {arguments.policy}, {arguments.n_gradients} gradients of {arguments.n_delta} perturbations"
+    )
+    for estimator in ("central", "forward", "regression"):
+        variances, steps = {}, {}
+        for common in (True, False):
+            model = FiniteDifference(
+                arguments.policy, make_vec_env(arguments.env, 8, seed=arguments.seed), learning_rate=0.0,
+                estimator=estimator, n_delta=arguments.n_delta, common_random_numbers=common, seed=arguments.seed,
+                device="cpu",
+            )  # fmt: skip
+            model.n_wanted, callback = arguments.n_gradients, Gradients()
+            model.learn(10**9, callback, log_interval=None)
+            variances[common] = float(th.stack(callback.gradients).var(0).sum())
+            steps[common] = model.num_timesteps
+        print(
+            f"  {estimator:10s} variance without / with {variances[False] / variances[True]:7.2f}"
+            f"   steps with / without {steps[True] / steps[False]:5.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

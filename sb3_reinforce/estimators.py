@@ -1,0 +1,149 @@
+"""
+Gradients of a utility from its values alone.
+
+An estimator is one function ``(U, θ, Δ) -> ĝ``: the utility, the centre of shape ``(n,)`` and the perturbations of
+shape ``(k, n)``. All three here are one least-squares problem, ``design · ĝ ≈ differences``, with different designs.
+Everything is float64, since differences of nearly equal numbers are taken.
+
+A utility maps candidates of shape ``(k, n)`` to ``(k,)``; it compares all of them with each other, so with common
+random numbers they all meet the same episodes. Candidates of shape ``(m, k, n)`` are compared within columns only, so
+that each of the k columns can meet episodes of its own; the result is of shape ``(m, k)``.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch as th
+
+Utility: TypeAlias = Callable[[th.Tensor], th.Tensor]
+Estimator: TypeAlias = Callable[[Utility, th.Tensor, th.Tensor], th.Tensor]
+
+
+def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
+    """
+    ``Δ ĝ ≈ U(θ + Δ) − U(θ)``: k + 1 evaluations, exact on linear utilities, error of order 1 in ‖Δ‖.
+
+    :param utility: U
+    :param theta: θ, shape ``(n,)``
+    :param deltas: Δ, shape ``(k, n)``
+    :return: ĝ, shape ``(n,)``
+    :raises ValueError: If all perturbations are zero
+    """
+    check_design(deltas, deltas)
+    utilities = utility(th.cat([theta[None], theta + deltas]))
+    return solve(deltas, utilities[1:] - utilities[0])
+
+
+def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_top: int | None = None) -> th.Tensor:
+    """
+    ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, exact on quadratic utilities, error of order 2 in ‖Δ‖.
+
+    :param utility: U
+    :param theta: θ, shape ``(n,)``
+    :param deltas: Δ, shape ``(k, n)``
+    :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
+        section 3.3), which biases ĝ towards them; None for all
+    :return: ĝ, shape ``(n,)``
+    :raises ValueError: If all perturbations are zero
+    """
+    check_design(deltas, deltas)
+    utilities = utility(th.stack([theta + deltas, theta - deltas]))
+    top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
+    plus, minus = utilities[:, top]
+    return solve(2 * deltas[top], plus - minus)
+
+
+def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
+    """
+    ``[1 Δ] [u₀ ĝ]ᵀ ≈ U(θ + Δ)``: k evaluations, exact on linear utilities, error of order 1 in ‖Δ‖.
+
+    The intercept u₀ is fitted by centring: ``(Δ − Δ̄) ĝ ≈ U − Ū`` has the same ĝ (Frisch and Waugh, 1933). Where there
+    are fewer perturbations than unknowns, this is the ĝ of least norm, and the level u₀ is not pulled towards zero.
+
+    :param utility: U
+    :param theta: θ, shape ``(n,)``
+    :param deltas: Δ, shape ``(k, n)``
+    :return: ĝ, shape ``(n,)``
+    :raises ValueError: If all perturbations are equal
+    """
+    design = deltas - deltas.mean(0)
+    check_design(design, deltas)
+    utilities = utility(theta + deltas)
+    return solve(design, utilities - utilities.mean())
+
+
+def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
+    """
+    Check that a least-squares problem has something to solve, before an environment is stepped for it.
+
+    :param design: Its design, shape ``(k, n)``
+    :param deltas: The perturbations that it is made of, shape ``(k, n)``
+    :raises ValueError: If the design is zero but for rounding
+    """
+    if design.abs().max() <= 1e-12 * deltas.abs().max():
+        raise ValueError(
+            f"The {len(deltas)} perturbations have no usable direction: forward and central differences need one that "
+            "is not zero, the regression needs two that are not equal. Raise n_delta, or change the perturbation"
+        )
+
+
+def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
+    """
+    ``ĝ = argmin ‖design · ĝ − differences‖²``, and of all such ĝ the one of least norm.
+
+    By the singular value decomposition, which is stable where perturbations are nearly collinear; the normal equations
+    would square their condition number.
+
+    :param design: Shape ``(k, n)``
+    :param differences: Shape ``(k,)``
+    :return: ĝ, shape ``(n,)``
+    """
+    gradient: th.Tensor = th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
+    return gradient
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    How well a gradient explains the utilities that it was estimated from.
+
+    :param r_squared: Share of their variance that ``u₀ + δ · ĝ`` explains; NaN where there is no variance
+    :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
+    :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None where the
+        evaluations do not determine every component and leave a degree of freedom
+    """
+
+    r_squared: float
+    residual_std: float
+    standard_error: th.Tensor | None
+
+
+def fit_quality(deltas: th.Tensor, utilities: th.Tensor, gradient: th.Tensor) -> Fit:
+    """
+    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − 1 − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred δ.
+
+    :param deltas: Every candidate that was evaluated, less θ, shape ``(m, n)``
+    :param utilities: Their utilities, shape ``(m,)``
+    :param gradient: ĝ, shape ``(n,)``
+    """
+    x, y = deltas - deltas.mean(0), utilities - utilities.mean()
+    residuals = y - x @ gradient
+    # Of the smaller of the two products: they have the same rank, and n may be large
+    rank = int(th.linalg.matrix_rank(x @ x.T if len(x) < len(gradient) else x.T @ x, hermitian=True))
+    degrees_of_freedom = len(y) - 1 - rank
+    squares, total = float(residuals @ residuals), float(y @ y)
+    residual_std = (squares / degrees_of_freedom) ** 0.5 if degrees_of_freedom > 0 else float("nan")
+    determined = degrees_of_freedom > 0 and rank == len(gradient)
+    return Fit(
+        r_squared=1 - squares / total if total > 0 else float("nan"),
+        residual_std=residual_std,
+        standard_error=residual_std * th.linalg.pinv(x).norm(dim=1) if determined else None,
+    )
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "regression": regression_gradient,
+    "central": central_difference,
+    "forward": forward_difference,
+}

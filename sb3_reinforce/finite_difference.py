@@ -1,0 +1,428 @@
+"""FiniteDifference as an algorithm of Stable-Baselines3."""
+
+import sys
+import time
+import warnings
+from functools import partial
+from typing import Any, ClassVar, TypeVar, cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce import optimization, parameters
+from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce.candidate_actors import LoopActor, make_actor
+from sb3_reinforce.candidates import Step, evaluate
+from sb3_reinforce.collection import shift_to_start
+from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
+from sb3_reinforce.linear_policy import LinearPolicy
+from sb3_reinforce.normalization import frozen
+from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.search_settings import (
+    check_candidates,
+    check_deltas,
+    check_finite_difference,
+    check_gradient,
+    default_delta_std,
+    default_n_delta,
+)
+
+SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
+
+
+class Stopped(Exception):
+    """A callback returned False: ends an update from inside the estimator."""
+
+
+class FiniteDifference(BaseAlgorithm):
+    """
+    Search in the space of a policy's parameters, by a gradient that is estimated from returns alone.
+
+    One optimizer step per update, along ĝ ≈ ∇θ U(θ), where U(θ) = E[Σ_t r_t] is the expected return of an episode:
+
+        ``central:     2Δ ĝ ≈ U(θ+Δ) − U(θ−Δ)``
+        ``forward:      Δ ĝ ≈ U(θ+Δ) − U(θ)``
+        ``regression: [1 Δ] [u₀ ĝ]ᵀ ≈ U(θ+Δ)``
+
+    (Peters and Schaal, 2008, section 3.1). No derivative of the policy is used, and returns are undiscounted. θ is the
+    actor's parameters; the critic and ``log_std`` are not searched. Different candidates act in different environments
+    of one VecEnv, in one batched forward pass.
+
+    With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
+    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it.
+
+    :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, or a subclass of
+        ``ActorCriticPolicy``)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str)
+    :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
+    :param estimator: ``"regression"``, ``"central"``, ``"forward"``, or a function of a utility, θ of shape ``(n,)``
+        and perturbations of shape ``(k, n)`` that returns a gradient of shape ``(n,)``
+    :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
+        ``torch.Generator`` that returns a tensor of shape ``(k, n)``
+    :param n_delta: k, the perturbations per update. None: 2n for the regression, n for the others, but at most 64
+    :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
+        (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
+    :param n_eval_episodes: Episodes behind each utility, which is their mean
+    :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the luck of
+        the start from differences, at the price of environments that idle until the longest episode of a round is over
+    :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
+    :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
+        ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``
+    :param deterministic: Whether candidates take their most likely actions, or sample
+    :param max_grad_norm: Bound on the norm of a step's gradient; None for no bound
+    :param max_episode_steps: The length beyond which an episode counts as one that never ends
+    :param stats_window_size: Window size for the rollout logging, in episodes
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises TypeError: If an argument is of the wrong kind
+    :raises ValueError: If an argument is out of its range, or does not go with another; the message names it
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "LinearPolicy": LinearPolicy,
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+    }
+    policy: ActorCriticPolicy
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 0.05,
+        estimator: str | Estimator = "regression",
+        perturbation: str | Perturbation = "gaussian",
+        n_delta: int | None = None,
+        delta_std: float | Schedule | None = None,
+        n_eval_episodes: int = 1,
+        common_random_numbers: bool = True,
+        n_top: int | None = None,
+        standardize_utilities: bool = True,
+        deterministic: bool = True,
+        max_grad_norm: float | None = None,
+        max_episode_steps: int = 100_000,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            check_spaces(env.observation_space, env.action_space)
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            policy_kwargs=None if policy_kwargs is None else dict(policy_kwargs),
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.estimator = estimator
+        self.perturbation = perturbation
+        self.n_delta = n_delta
+        self.delta_std = delta_std
+        self.n_eval_episodes = n_eval_episodes
+        self.common_random_numbers = common_random_numbers
+        self.n_top = n_top
+        self.standardize_utilities = standardize_utilities
+        self.deterministic = deterministic
+        self.max_grad_norm = max_grad_norm
+        self.max_episode_steps = max_episode_steps
+        self._generator: th.Generator | None = None
+        self._warned = False
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate)
+        if self.delta_std is not None:
+            self.delta_std_schedule = CheckedSchedule("delta_std", self.delta_std, above=True)
+
+    def _setup_model(self) -> None:
+        check_finite_difference(self)
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        policy_class = cast(type[ActorCriticPolicy], self.policy_class)
+        policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        self.policy = policy.to(self.device)
+        self._actor_parameters = parameters.actor_parameters(self.policy)
+        if self.n_delta is None:
+            self.n_delta = default_n_delta(self.estimator, self.n_parameters)
+        if self._generator is None:
+            # Seeded by the global generator, which the seed has just set
+            self._generator = th.Generator().manual_seed(int(th.randint(2**31, ())))
+
+    @property
+    def theta(self) -> th.Tensor:
+        """θ, a copy of the actor's parameters, shape ``(n,)``, float64."""
+        return parameters.read(self._actor_parameters)
+
+    @property
+    def n_parameters(self) -> int:
+        """n, the number of parameters that are searched."""
+        return sum(parameter.numel() for parameter in self._actor_parameters)
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # An update that begins after a callback or a user has moved the count must not train at a negative rate
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def learn(
+        self: SelfFiniteDifference,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 10,
+        tb_log_name: str = "FiniteDifference",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFiniteDifference:
+        """
+        Train until at least ``total_timesteps`` environment steps are made.
+
+        :param total_timesteps: Environment steps, of all environments together; the last update is finished
+        :param callback: Called at each step of the environments; ``model.policy`` is then the centre θ
+        :param log_interval: Updates between two entries of the log; None for no log
+        :param tb_log_name: The name of the run for tensorboard
+        :param reset_num_timesteps: Whether to begin the count of steps, and the episodes, anew
+        :param progress_bar: Display a progress bar using tqdm and rich
+        :return: The trained model
+        :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
+            finite, a design cannot be solved, or an episode does not end. The policy is the last good one
+        """
+        check_number("total_timesteps", total_timesteps, 0)
+        if log_interval is not None:
+            check_integer("log_interval", log_interval, 1)
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        self._prepare_search()
+        callback.on_training_start(locals(), globals())
+        iteration = 0
+        while self.num_timesteps < total_timesteps:
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            try:
+                gradient = self.estimate_gradient(callback)
+            except Stopped:
+                break
+            self.train(gradient)
+            iteration += 1
+            if log_interval is not None and iteration % log_interval == 0:
+                self.dump_logs(iteration)
+        callback.on_training_end()
+        return self
+
+    def _prepare_search(self) -> None:
+        """What a run needs besides θ, built anew for each: the actor, and a word on what to expect."""
+        env = cast(VecEnv, self.env)
+        self._actor = make_actor(self.policy, self._actor_parameters, env.num_envs, self.deterministic)
+        if self.verbose >= 1 and isinstance(self._actor, LoopActor):
+            print(f"{type(self.policy).__name__} has code of its own: candidates act one by one, which is slower")
+        n_delta = cast(int, self.n_delta)
+        if self.estimator == "regression" and n_delta <= self.n_parameters and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"n_delta={n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters and "
+                "an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
+                stacklevel=3,
+            )
+
+    def estimate_gradient(self, callback: BaseCallback) -> th.Tensor:
+        """
+        Perturb θ, evaluate the candidates and estimate ∇U(θ). Nothing is changed but the count of steps.
+
+        :param callback: Called at each step, and at the beginning and end of the rollout
+        :return: ĝ, shape ``(n,)``
+        :raises Stopped: If the callback returns False
+        :raises ValueError: As ``learn``
+        """
+        theta = self.theta
+        self._delta_std = (
+            default_delta_std(theta)
+            if self.delta_std is None
+            else self.delta_std_schedule(self._current_progress_remaining)
+        )
+        perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
+        n_delta, generator = cast(int, self.n_delta), cast(th.Generator, self._generator)
+        deltas = self._delta_std * check_deltas(perturbation(n_delta, len(theta), generator), n_delta, len(theta))
+        estimator = check_function("estimator", self.estimator, ESTIMATORS)
+        if self.n_top is not None:
+            estimator = partial(central_difference, n_top=self.n_top)
+
+        self._candidates: list[th.Tensor] = []
+        self._utilities: list[th.Tensor] = []
+        utility = partial(self._utility, callback, int(th.randint(2**31, (), generator=generator)))
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()
+        try:
+            with frozen(self._vec_normalize_env) as self._observed:
+                gradient = check_gradient(estimator(utility, theta, deltas), len(theta))
+                if not self._utilities:
+                    raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
+        finally:
+            # The environments are in the middle of episodes, and are reset before they are used again
+            self._last_obs = None
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return gradient
+
+    def _utility(self, callback: BaseCallback, first_seed: int, candidates: th.Tensor) -> th.Tensor:
+        """
+        U of candidates: the mean return of ``n_eval_episodes`` episodes of each.
+
+        :param callback: Called at each step
+        :param first_seed: The seed of the update's first episode
+        :param candidates: Shape ``(k, n)``, or ``(m, k, n)`` where only candidates of one column are compared
+        :return: Shape ``(k,)`` or ``(m, k)``, float64
+        """
+        thetas = check_candidates(candidates, self.n_parameters).reshape(-1, self.n_parameters)
+        columns = np.arange(len(thetas)) % candidates.shape[1] if candidates.dim() == 3 else np.zeros(len(thetas), int)
+        episodes = np.arange(self.n_eval_episodes)
+        seeds = (first_seed + columns[:, None] * self.n_eval_episodes + episodes) % 2**31
+        returns = evaluate(
+            self._actor,
+            cast(VecEnv, self.env),
+            thetas,
+            seeds if self.common_random_numbers else None,
+            self.n_eval_episodes,
+            self.max_episode_steps,
+            partial(self._on_step, callback),
+            self._vec_normalize_env,
+        )
+        utilities = th.as_tensor(returns).mean(1)
+        self._candidates.append(thetas)
+        self._utilities.append(utilities)
+        return utilities.reshape(candidates.shape[:-1])
+
+    def _on_step(self, callback: BaseCallback, step: Step) -> None:
+        """Count a step of the environments and tell the callback; raise ``Stopped`` if it returns False."""
+        self.num_timesteps += len(step.dones)
+        if step.finished.any():
+            finished = np.flatnonzero(step.finished)
+            self._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
+        callback.update_locals({"self": self, **vars(step)})
+        if self._observed is None:
+            go_on = callback.on_step()
+        else:
+            self._observed.update()
+            # A callback may save the wrapper, and must find it as the user has set it
+            self._observed.vec_normalize.training = True
+            go_on = callback.on_step()
+            self._observed.vec_normalize.training = False
+        if not go_on:
+            raise Stopped
+
+    def train(self, gradient: th.Tensor) -> None:
+        """
+        One optimizer step uphill.
+
+        :param gradient: ĝ, shape ``(n,)``
+        :raises ValueError: If the step is not finite; the parameters are those before it
+        """
+        candidates, utilities = th.cat(self._candidates), th.cat(self._utilities)
+        fit = fit_quality(candidates - self.theta, utilities, gradient)
+        utility_std = float(utilities.std(correction=0))
+        self._update_learning_rate(self.policy.optimizer)
+        if self.standardize_utilities and utility_std > 0:
+            gradient = gradient * self._delta_std / utility_std
+        # The optimizer descends: here, and only here, the sign turns
+        loss_gradient = [part[0] for part in parameters.split(-gradient[None], self._actor_parameters)]
+        grad_norm = optimization.step(
+            self.policy.optimizer, self._actor_parameters, loss_gradient, self.max_grad_norm, "utility"
+        )
+        self._n_updates += 1
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/delta_std", self._delta_std)
+        self.logger.record("train/grad_norm", grad_norm)
+        self.logger.record("train/r_squared", fit.r_squared)
+        self.logger.record("train/residual_std", fit.residual_std)
+        if fit.standard_error is not None:
+            self.logger.record("train/standard_error", float(fit.standard_error.mean()))
+        self.logger.record("rollout/utility_mean", float(utilities.mean()))
+        self.logger.record("rollout/utility_std", utility_std)
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """
+        Write the log.
+
+        :param iteration: Updates of this run so far
+        """
+        time_elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        if iteration > 0:
+            self.logger.record("time/iterations", iteration, exclude="tensorboard")
+        if self.ep_info_buffer:
+            self.logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / time_elapsed))
+        self.logger.record("time/time_elapsed", int(time_elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
+
+        :param observation: The input observation
+        :param state: Passed on; the policies are not recurrent
+        :param episode_start: Passed on
+        :param deterministic: Whether to return the most likely action instead of a sample
+        :return: The action and ``state``
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return shift_to_start(self.action_space, actions), state
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        Take parameters from a file or dictionary, which may be those of another algorithm with the same policy class.
+
+        :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` of a model returns
+        :param exact_match: Whether the parameters must be those of a FiniteDifference; if not, those of objects that it
+            does not have, such as an optimizer for the critic, are left out
+        :param device: Device on which the parameters are loaded
+        """
+        if not exact_match:
+            if not isinstance(load_path_or_dict, dict):
+                _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
+            mine = self._get_torch_save_params()[0]
+            load_path_or_dict = {name: load_path_or_dict[name] for name in mine if name in load_path_or_dict}
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def _excluded_save_params(self) -> list[str]:
+        mine = ["_actor_parameters", "_actor", "_candidates", "_utilities", "_observed"]
+        return [*super()._excluded_save_params(), *mine]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []

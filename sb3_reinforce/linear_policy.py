@@ -1,0 +1,35 @@
+"""The policy with the fewest parameters."""
+
+from typing import Any, cast
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import Schedule
+
+
+class LinearPolicy(ActorCriticPolicy):
+    """
+    An ``ActorCriticPolicy`` whose means or logits are ``W s``, linear in the (flattened) observation.
+
+    No hidden layers, and the bias stays 0, as in ARS: observations are often small, and a perturbed bias would decide
+    every action alone. The actor has (observation dimension) × (number of means or logits) parameters.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
+    :param kwargs: As for ``ActorCriticPolicy``
+    :raises ValueError: If ``net_arch`` asks for hidden layers
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        **kwargs: Any,
+    ):
+        if kwargs.get("net_arch"):
+            raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={kwargs['net_arch']!r}: use MlpPolicy")
+        super().__init__(observation_space, action_space, lr_schedule, **{**kwargs, "net_arch": []})
+        th.nn.init.zeros_(cast(th.Tensor, self.action_net.bias)).requires_grad_(False)

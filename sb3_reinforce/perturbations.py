@@ -1,0 +1,80 @@
+"""
+Directions in which the parameters are perturbed, one function each.
+
+The random ones have unit standard deviation in every component, ``E[δ δᵀ] = I``, so that ``delta_std`` is the standard
+deviation of what is added to a parameter, as in ARS, whichever of them is used.
+"""
+
+import math
+from collections.abc import Callable
+from typing import TypeAlias
+
+import torch as th
+
+# (k, n, generator) -> deltas of shape (k, n), float64
+Perturbation: TypeAlias = Callable[[int, int, th.Generator], th.Tensor]
+
+
+def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    One parameter at a time: ``δ = ± e_j``.
+
+    Each pass over the parameters is in a new random order; the first pass has the sign +, the second −, and so on, so
+    that ``2 n`` rows are the central differences of all parameters.
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``, every row a unit vector
+    """
+    deltas = []
+    for first in range(0, k, n):
+        rows = th.eye(n, dtype=th.float64)[th.randperm(n, generator=generator)][: k - first]
+        deltas.append(rows if (first // n) % 2 == 0 else -rows)
+    return th.cat(deltas)
+
+
+def sphere(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    Uniform on the sphere of radius √n: ``δ = √n z / ‖z‖`` with ``z ~ N(0, I)``.
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``, every row of norm √n
+    """
+    deltas = gaussian(k, n, generator)
+    norms: th.Tensor = th.linalg.vector_norm(deltas, dim=1, keepdim=True)
+    return math.sqrt(n) * deltas / norms
+
+
+def gaussian(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    ``δ ~ N(0, I)``, the perturbation of ARS and of evolution strategies.
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``
+    """
+    return th.randn(k, n, dtype=th.float64, generator=generator)
+
+
+def rademacher(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    ``δ_i = ± 1`` with equal probability, the perturbation of SPSA (Spall, 1992).
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``, every row of norm √n
+    """
+    return 2 * th.randint(2, (k, n), generator=generator).double() - 1
+
+
+PERTURBATIONS: dict[str, Perturbation] = {
+    "coordinate": coordinate,
+    "gaussian": gaussian,
+    "rademacher": rademacher,
+    "sphere": sphere,
+}

@@ -1,0 +1,262 @@
+"""Candidates side by side: the same as one by one, from the starts that they should have, and none of them twice."""
+
+from collections import Counter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+
+from sb3_reinforce import parameters
+from sb3_reinforce.candidate_actors import LoopActor, MatrixActor, VmapActor, actor_class, make_actor, mode
+from sb3_reinforce.candidates import Step, evaluate, queues, start
+from sb3_reinforce.linear_policy import LinearPolicy
+
+BOX = spaces.Box(-1, 1, (3,))
+IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+ACTIONS = [
+    spaces.Box(-0.2, 0.3, (2,)),
+    spaces.Discrete(3),
+    spaces.Discrete(3, start=-1),
+    spaces.MultiDiscrete([2, 3]),
+    spaces.MultiBinary(4),
+]
+K = 4
+
+
+class OwnPrediction(ActorCriticPolicy):
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        return super()._predict(observation, deterministic)
+
+
+POLICIES = [
+    (LinearPolicy, BOX, {}, MatrixActor),
+    (ActorCriticPolicy, BOX, {}, MatrixActor),
+    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), VmapActor),
+    (ActorCriticPolicy, spaces.Discrete(5), {}, MatrixActor),
+    (ActorCriticPolicy, spaces.Box(-1, 1, (2, 3)), dict(share_features_extractor=False), MatrixActor),
+    (ActorCriticCnnPolicy, IMAGE, {}, VmapActor),
+    (ActorCriticCnnPolicy, IMAGE, dict(share_features_extractor=False, net_arch=[5]), VmapActor),
+    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": spaces.Discrete(2)}), {}, MatrixActor),
+    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": IMAGE}), {}, VmapActor),
+    (OwnPrediction, BOX, {}, LoopActor),
+    (ActorCriticPolicy, BOX, dict(use_sde=True, squash_output=True), LoopActor),
+]
+
+
+def sample(space: spaces.Space, n: int) -> Any:
+    space.seed(0)
+    rows = [space.sample() for _ in range(n)]
+    if isinstance(space, spaces.Dict):
+        return {key: np.stack([row[key] for row in rows]) for key in space.spaces}
+    return np.stack(rows)
+
+
+def take(obs: Any, i: int) -> Any:
+    return {key: part[i] for key, part in obs.items()} if isinstance(obs, dict) else obs[i]
+
+
+def perturbed(policy: ActorCriticPolicy, k: int, scale: float = 0.3) -> tuple[list[th.nn.Parameter], th.Tensor]:
+    actor = parameters.actor_parameters(policy)
+    theta = parameters.read(actor)
+    generator = th.Generator().manual_seed(0)
+    return actor, theta + scale * th.randn(k, len(theta), dtype=th.float64, generator=generator)
+
+
+@pytest.mark.parametrize("actions", ACTIONS, ids=str)
+@pytest.mark.parametrize(("policy_class", "obs_space", "kwargs", "expected"), POLICIES)
+def test_side_by_side_is_one_by_one(
+    policy_class: type[ActorCriticPolicy],
+    obs_space: spaces.Space,
+    kwargs: dict[str, Any],
+    expected: type,
+    actions: spaces.Space,
+) -> None:
+    if kwargs.get("use_sde") and not isinstance(actions, spaces.Box):
+        pytest.skip("gSDE is for Box actions")
+    th.manual_seed(0)
+    policy = policy_class(obs_space, actions, lambda _: 1e-3, **kwargs)
+    assert actor_class(policy) is expected
+    actor, thetas = perturbed(policy, K)
+    obs, before = sample(obs_space, K), parameters.read(actor)
+    together = make_actor(policy, actor, K, deterministic=True)
+    # In two parts, and the first part twice, as environments are refilled
+    together.assign([0, 2], thetas[[1, 2]])
+    together.assign([0, 1, 3], thetas[[0, 1, 3]])
+    batched = together.act(obs)
+    assert th.equal(parameters.read(actor), before)
+    for i in range(K):
+        parameters.write(actor, thetas[i])
+        alone, _ = policy.predict(take(obs, i), deterministic=True)
+        expected_action = alone + getattr(actions, "start", 0)
+        np.testing.assert_allclose(batched[i], expected_action, rtol=1e-4, atol=1e-5)
+        assert actions.contains(batched[i].astype(actions.dtype))
+
+
+@pytest.mark.parametrize("actions", ACTIONS, ids=str)
+def test_the_mode_is_that_of_the_distribution(actions: spaces.Space) -> None:
+    policy = ActorCriticPolicy(BOX, actions, lambda _: 1e-3)
+    with th.no_grad():
+        policy.action_net.weight.mul_(1000)
+        obs = th.as_tensor(sample(BOX, 50))
+        outputs = policy.action_net(policy.mlp_extractor.forward_actor(obs))
+        expected = policy.get_distribution(obs).get_actions(deterministic=True)
+    assert th.equal(mode(outputs, actions), expected)
+
+
+@pytest.mark.parametrize("actions", ACTIONS, ids=str)
+def test_stochastic_candidates_sample_the_policy(actions: spaces.Space) -> None:
+    n = 4000
+    policy = ActorCriticPolicy(BOX, actions, lambda _: 1e-3)
+    actor, thetas = perturbed(policy, 1)
+    together = make_actor(policy, actor, n, deterministic=False)
+    together.assign(range(n), thetas.expand(n, -1))
+    obs = sample(BOX, 1).repeat(n, axis=0)
+    drawn = together.act(obs).reshape(n, -1).astype(float)
+    parameters.write(actor, thetas[0])
+    expected = policy.predict(obs, deterministic=False)[0].reshape(n, -1) + np.array(getattr(actions, "start", 0))
+    assert (drawn.std(0) > 0).all()
+    error = (drawn.var(0) / n + expected.var(0) / n) ** 0.5
+    assert (np.abs(drawn.mean(0) - expected.mean(0)) < 5 * error).all()
+
+
+class Counting(gym.Env):
+    """Ends after as many steps as its first action says; its observation is a random number of its own, and a 1."""
+
+    observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Box(0, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.steps, self.draw = 0, self.np_random.uniform(-1, 1)
+        return np.array([self.draw, 1], dtype=np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.steps += 1
+        # Dynamics that draw random numbers, so that how long an episode is changes what follows
+        self.np_random.uniform()
+        length = 1 + round(float(action[0]) * 10)
+        return np.array([self.draw, 1], dtype=np.float32), 1.0, self.steps >= length, False, {}
+
+
+def lengths_policy(lengths: list[int]) -> tuple[ActorCriticPolicy, list[th.nn.Parameter], th.Tensor]:
+    """A linear policy of which candidate i ends its episodes after ``lengths[i]`` steps of ``Counting``."""
+    policy = LinearPolicy(Counting.observation_space, Counting.action_space, lambda _: 1e-3)
+    return (
+        policy,
+        parameters.actor_parameters(policy),
+        th.tensor([[0.0, (length - 1) / 10] for length in lengths]).double(),
+    )
+
+
+def record(steps: list[Step]) -> Any:
+    return steps.append
+
+
+@pytest.mark.parametrize("seeded", [True, False])
+@pytest.mark.parametrize("n_envs", [1, 3, 8])
+def test_every_candidate_has_exactly_its_episodes(n_envs: int, seeded: bool) -> None:
+    lengths, n_episodes = [1, 9, 2, 5, 1], 2
+    policy, actor, thetas = lengths_policy(lengths)
+    env, steps = make_vec_env(Counting, n_envs), []
+    seeds = np.arange(10).reshape(5, 2) if seeded else None
+    returns = evaluate(make_actor(policy, actor, n_envs, True), env, thetas, seeds, n_episodes, 100, record(steps))
+    np.testing.assert_array_equal(returns, np.repeat(np.array(lengths)[:, None], 2, axis=1))
+    ended = Counter(step.infos[i]["episode"]["l"] for step in steps for i in np.flatnonzero(step.finished))
+    assert ended == Counter(lengths * n_episodes)
+
+
+def test_a_queue_without_rounds_leaves_no_environment_idle_while_it_lasts() -> None:
+    policy, actor, thetas = lengths_policy([9] + [3] * 6)
+    steps: list[Step] = []
+    evaluate(make_actor(policy, actor, 3, True), make_vec_env(Counting, 3), thetas, None, 1, 100, record(steps))
+    # 27 steps of candidates in three environments
+    assert len(steps) == 9
+
+
+def test_rounds_and_queue_hold_every_pair_once() -> None:
+    pairs = [(candidate, episode) for episode in range(2) for candidate in range(5)]
+    assert queues(5, 2, 4, in_rounds=False) == [pairs]
+    rounds = queues(5, 2, 4, in_rounds=True)
+    assert [pair for queue in rounds for pair in queue] == pairs and max(map(len, rounds)) == 4
+
+
+def wrap(name: str) -> Any:
+    if name == "SubprocVecEnv":
+        return SubprocVecEnv([Counting] * 3)
+    env = DummyVecEnv([Counting] * 3)
+    wrappers = {
+        "DummyVecEnv": lambda x: x,
+        "VecNormalize": VecNormalize,
+        "VecFrameStack": lambda x: VecFrameStack(x, 2),
+    }
+    return wrappers[name](env)
+
+
+@pytest.mark.parametrize("name", ["DummyVecEnv", "SubprocVecEnv", "VecNormalize", "VecFrameStack"])
+def test_equal_seeds_are_equal_starts_in_every_environment_and_at_every_time(name: str) -> None:
+    env = wrap(name)
+    if isinstance(env, VecNormalize):
+        env.training = False
+    seeds = np.array([[11], [11], [12], [12], [11], [13]])
+    first = start(env, [(0, 0), (1, 0), (2, 0)], seeds)
+    for _ in range(5):
+        env.step(np.zeros((3, 1), dtype=np.float32))
+    second = start(env, [(3, 0), (4, 0), (5, 0)], seeds)
+    env.close()
+    assert np.array_equal(first[0], first[1]) and np.array_equal(first[0], second[1])
+    assert np.array_equal(first[2], second[0])
+    assert len({row.tobytes() for row in (first[0], first[2], second[2])}) == 3
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_a_number_that_is_not_finite_is_named(what: str) -> None:
+    class Broken(Counting):
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+            obs, reward, terminated, truncated, info = super().step(action)
+            if self.steps == 4:
+                obs, reward = (obs, np.nan) if what == "reward" else (obs * np.inf, reward)
+            return obs, reward, terminated, truncated, info
+
+    policy, actor, thetas = lengths_policy([2, 3, 1, 7])
+    env = make_vec_env(Broken, 2)
+    with pytest.raises(ValueError, match=f"The {what} of candidate 3, episode 0, step 3 .* is not finite"):
+        evaluate(make_actor(policy, actor, 2, True), env, thetas, None, 1, 100, record([]))
+
+
+def test_large_finite_numbers_are_no_error() -> None:
+    class Large(Counting):
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+            obs, _, *rest = super().step(action)
+            return obs, 1e30, *rest
+
+    policy, actor, thetas = lengths_policy([2])
+    returns = evaluate(make_actor(policy, actor, 1, True), make_vec_env(Large, 1), thetas, None, 1, 100, record([]))
+    assert returns[0, 0] == pytest.approx(2e30)
+
+
+@pytest.mark.parametrize("seeded", [True, False])
+def test_an_episode_that_does_not_end_is_named(seeded: bool) -> None:
+    policy, actor, thetas = lengths_policy([2, 3, 9])
+    seeds = np.zeros((3, 1), dtype=int) if seeded else None
+    env = make_vec_env(Counting, 2)
+    with pytest.raises(ValueError, match=r"max_episode_steps=8 steps .candidate 2, episode 0"):
+        evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 8, record([]))
+    evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 9, record([]))
+
+
+def test_a_vec_env_that_cannot_seed_its_environments_is_an_error() -> None:
+    class Unseedable(DummyVecEnv):
+        def env_method(self, *args: Any, **kwargs: Any) -> list[Any]:
+            raise NotImplementedError
+
+    with pytest.raises(ValueError, match="set common_random_numbers=False"):
+        start(Unseedable([Counting]), [(0, 0)], np.zeros((1, 1), dtype=int))

@@ -1,0 +1,158 @@
+"""Estimators: exact where they say so, of the order that they say, and one identity between two of them."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_reinforce.estimators import (
+    ESTIMATORS,
+    Utility,
+    central_difference,
+    fit_quality,
+    forward_difference,
+    regression_gradient,
+)
+from sb3_reinforce.perturbations import gaussian
+
+N = 5
+SEEDS = pytest.mark.parametrize("seed", range(20))
+
+
+def normal(*shape: int, seed: int) -> th.Tensor:
+    return gaussian(int(np.prod(shape[:-1])), shape[-1], th.Generator().manual_seed(seed)).reshape(shape)
+
+
+def linear(seed: int) -> tuple[Utility, th.Tensor]:
+    slope = normal(1, N, seed=seed)[0]
+    return lambda x: x @ slope + 7, slope
+
+
+@SEEDS
+def test_all_are_exact_on_linear_utilities(seed: int) -> None:
+    utility, slope = linear(seed)
+    theta, deltas = normal(1, N, seed=seed + 1)[0], normal(2 * N, N, seed=seed + 2)
+    for estimator in ESTIMATORS.values():
+        th.testing.assert_close(estimator(utility, theta, deltas), slope)
+
+
+@SEEDS
+def test_central_is_exact_on_quadratic_utilities(seed: int) -> None:
+    matrix, theta = normal(N, N, seed=seed), normal(1, N, seed=seed + 1)[0]
+
+    def utility(x: th.Tensor) -> th.Tensor:
+        return ((x @ matrix) * x).sum(-1) + x.sum(-1)
+
+    gradient = (matrix + matrix.T) @ theta + 1
+    deltas = normal(N, N, seed=seed + 2)
+    th.testing.assert_close(central_difference(utility, theta, deltas), gradient, rtol=1e-6, atol=1e-6)
+    assert not th.allclose(forward_difference(utility, theta, deltas), gradient, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "order"), [("forward", 1), ("regression", 1), ("central", 2)])
+def test_the_error_is_of_the_declared_order(name: str, order: int) -> None:
+    theta = th.linspace(-1, 1, N, dtype=th.float64)
+    deltas = normal(3 * N, N, seed=0)
+    sizes = 2.0 ** -np.arange(4, 10)
+    gradient = th.exp(theta)
+    errors = [
+        float((ESTIMATORS[name](lambda x: x.exp().sum(-1), theta, size * deltas) - gradient).norm()) for size in sizes
+    ]
+    measured, _ = np.polyfit(np.log(sizes), np.log(errors), 1)
+    assert measured == pytest.approx(order, abs=0.1)
+
+
+@SEEDS
+@pytest.mark.parametrize("k", [1, 2, N, 2 * N])
+def test_regression_on_mirrored_perturbations_is_the_central_difference(seed: int, k: int) -> None:
+    theta, deltas = normal(1, N, seed=seed)[0], normal(k, N, seed=seed + 1)
+
+    def utility(x: th.Tensor) -> th.Tensor:
+        return th.sin(3 * x).sum(-1) + 100
+
+    mirrored = regression_gradient(utility, theta, th.cat([deltas, -deltas]))
+    th.testing.assert_close(mirrored, central_difference(utility, theta, deltas))
+
+
+def test_known_gradients() -> None:
+    two = th.tensor([2.0]).double()
+    square = central_difference(lambda x: (x**2).sum(-1), two, th.tensor([[0.1]]).double())
+    th.testing.assert_close(square, th.tensor([4.0]).double())
+    theta, deltas = normal(1, N, seed=0)[0], normal(2 * N, N, seed=1)
+    for estimator in (central_difference, lambda *args: regression_gradient(*args[:2], th.cat([args[2], -args[2]]))):
+        th.testing.assert_close(estimator(lambda x: -(x**2).sum(-1), theta, deltas), -2 * theta)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(name: str) -> None:
+    utility, slope = linear(0)
+    deltas = normal(3, N, seed=1)
+    directions = deltas - deltas.mean(0) if name == "regression" else deltas
+    estimate = ESTIMATORS[name](utility, th.zeros(N).double(), deltas)
+    # The solution of least norm lies in the span of the directions, where it agrees with the gradient
+    th.testing.assert_close(estimate, th.linalg.pinv(directions) @ directions @ slope)
+
+
+def test_evaluations_per_gradient() -> None:
+    k, counts = 4, {}
+    for name, estimator in ESTIMATORS.items():
+
+        def utility(x: th.Tensor, name: str = name) -> th.Tensor:
+            counts[name] = counts.get(name, 0) + x[..., 0].numel()
+            return x.sum(-1)
+
+        estimator(utility, th.zeros(N).double(), normal(k, N, seed=0))
+    assert counts == {"forward": k + 1, "central": 2 * k, "regression": k}
+
+
+def test_nearly_collinear_perturbations_are_solved_to_what_their_condition_allows() -> None:
+    utility, slope = linear(0)
+    deltas = normal(1, N, seed=1) + 1e-6 * normal(2 * N, N, seed=2)
+    # Of the normal equations, whose condition is the square, no digit would be left
+    th.testing.assert_close(central_difference(utility, th.zeros(N).double(), deltas), slope, rtol=1e-6, atol=1e-6)
+
+
+def test_n_top_is_the_central_difference_of_the_best_perturbations() -> None:
+    theta, deltas = th.zeros(N).double(), normal(6, N, seed=0)
+
+    def utility(x: th.Tensor) -> th.Tensor:
+        return x.exp().sum(-1)
+
+    best = th.maximum(utility(deltas), utility(-deltas)).argsort(descending=True)[:2]
+    th.testing.assert_close(
+        central_difference(utility, theta, deltas, n_top=2), central_difference(utility, theta, deltas[best])
+    )
+    th.testing.assert_close(
+        central_difference(utility, theta, deltas, n_top=6), central_difference(utility, theta, deltas)
+    )
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(name: str) -> None:
+    def utility(x: th.Tensor) -> th.Tensor:
+        raise AssertionError("evaluated")
+
+    equal = th.full((4, N), 0.1 if name == "regression" else 0.0).double()
+    with pytest.raises(ValueError, match="4 perturbations have no usable direction"):
+        ESTIMATORS[name](utility, th.zeros(N).double(), equal)
+
+
+def test_fit_quality_is_that_of_a_textbook_regression() -> None:
+    m = 400
+    slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]
+    utilities = 3 + deltas @ slope + 0.5 * noise
+    gradient = regression_gradient(lambda x: utilities, th.zeros(N).double(), deltas)
+    fit = fit_quality(deltas, utilities, gradient)
+    design = th.cat([th.ones(m, 1).double(), deltas], dim=1)
+    hat = design @ th.linalg.inv(design.T @ design) @ design.T
+    residuals = utilities - hat @ utilities
+    variance = residuals @ residuals / (m - N - 1)
+    assert fit.residual_std == pytest.approx(float(variance**0.5))
+    assert fit.r_squared == pytest.approx(float(1 - residuals.var() / utilities.var()))
+    assert fit.standard_error is not None
+    th.testing.assert_close(fit.standard_error, (variance * th.linalg.inv(design.T @ design).diag()[1:]).sqrt())
+
+
+def test_fit_quality_without_degrees_of_freedom_or_variance_is_not_made_up() -> None:
+    deltas = normal(3, N, seed=0)
+    fit = fit_quality(deltas, th.ones(3).double(), th.zeros(N).double())
+    assert np.isnan(fit.r_squared) and np.isnan(fit.residual_std) and fit.standard_error is None

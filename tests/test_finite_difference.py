@@ -1,0 +1,488 @@
+"""FiniteDifference as an algorithm of Stable-Baselines3: counts, callbacks, going on, and what may go wrong."""
+
+import os
+import signal
+import threading
+import time
+import warnings
+from collections import deque
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv, IdentityEnv, IdentityEnvBox, SimpleMultiObsEnv
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+
+from sb3_reinforce import FiniteDifference
+from sb3_reinforce.estimators import central_difference
+
+LINEAR = ("LinearPolicy", "CartPole-v1")
+SMALL: dict[str, Any] = dict(n_delta=3, estimator="central", seed=0, device="cpu")
+
+
+def make(env: Any = "CartPole-v1", policy: Any = "LinearPolicy", **kwargs: Any) -> FiniteDifference:
+    return FiniteDifference(policy, env, **{**SMALL, **kwargs})
+
+
+class Line(gym.Env):
+    """One step an episode: the reward is −(a − 3 s)², with s drawn at reset."""
+
+    observation_space, action_space = spaces.Box(-1, 1, (1,)), spaces.Box(-9, 9, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(-1, 1, 1).astype(np.float32)
+        return self.state, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return self.state, -float((action[0] - 3 * self.state[0]) ** 2), True, False, {}
+
+
+class Recorder(BaseCallback):
+    """Notes what a callback can see at each step, and stops at one of them."""
+
+    def __init__(self, stop_at: int | None = None):
+        super().__init__()
+        self.stop_at, self.thetas, self.counts, self.starts, self.ends = stop_at, [], [], 0, 0
+
+    def _on_rollout_start(self) -> None:
+        self.starts += 1
+        self.centre = self.model.theta
+
+    def _on_rollout_end(self) -> None:
+        self.ends += 1
+
+    def _on_step(self) -> bool:
+        assert {"self", "new_obs", "rewards", "dones", "infos"} <= self.locals.keys()
+        assert th.equal(self.model.theta, self.centre)
+        self.counts.append(self.num_timesteps)
+        return self.stop_at is None or self.n_calls < self.stop_at
+
+
+def test_the_gradient_is_the_estimator_applied_to_the_utility() -> None:
+    model = make(Line(), perturbation="gaussian", delta_std=0.1, n_delta=4, standardize_utilities=False)
+    model._setup_learn(1)
+    model._prepare_search()
+    gradient = model.estimate_gradient(Recorder_initialised(model))
+    starts = th.cat(model._candidates)
+    # In Line with W = w, U = −(w s − 3 s)² = −(w − 3)² s² for the start s of the column
+    utilities = th.cat(model._utilities).reshape(2, 4)
+    candidates = starts.reshape(2, 4)
+    s_squared = -utilities / (candidates - 3) ** 2
+    th.testing.assert_close(s_squared[0], s_squared[1], rtol=1e-4, atol=1e-6)
+    assert len(s_squared[0].unique()) == 4
+    theta, deltas = model.theta, candidates[0] - model.theta
+    expected = central_difference(lambda x: -((x[..., 0] - 3) ** 2) * s_squared[0], theta, deltas[:, None])
+    th.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-4)
+
+
+def Recorder_initialised(model: FiniteDifference) -> Recorder:
+    callback = Recorder()
+    callback.init_callback(model)
+    return callback
+
+
+@pytest.mark.parametrize("estimator", ["regression", "central", "forward"])
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_it_learns_the_line(estimator: str, n_envs: int) -> None:
+    model = make(make_vec_env(Line, n_envs), estimator=estimator, n_delta=8, learning_rate=0.1).learn(3000)
+    assert float(model.theta) == pytest.approx(3, abs=0.2)
+
+
+@pytest.mark.parametrize("common_random_numbers", [True, False])
+def test_every_real_step_is_counted_once(common_random_numbers: bool) -> None:
+    class Counted(gym.Wrapper):
+        steps = 0
+
+        def step(self, action: Any) -> Any:
+            Counted.steps += 1
+            return super().step(action)
+
+    env = make_vec_env("CartPole-v1", 3, wrapper_class=Counted)
+    callback = Recorder()
+    model = make(env, n_eval_episodes=2, common_random_numbers=common_random_numbers).learn(500, callback)
+    assert model.num_timesteps == Counted.steps == callback.counts[-1]
+    assert callback.counts == list(range(3, 3 * len(callback.counts) + 1, 3))
+    assert callback.starts == callback.ends == model._n_updates
+
+
+def test_an_update_once_begun_is_finished_and_none_is_begun_after_the_end() -> None:
+    class Updates(BaseCallback):
+        at: ClassVar[list[int]] = []
+
+        def _on_rollout_start(self) -> None:
+            self.at.append(self.num_timesteps)
+
+        def _on_step(self) -> bool:
+            return True
+
+    callback = Updates()
+    model = make().learn(300, callback)
+    assert callback.at[-1] < 300 <= model.num_timesteps
+    assert len(callback.at) == model._n_updates
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_a_callback_stops_at_the_very_step(n_envs: int) -> None:
+    model = make(make_vec_env("CartPole-v1", n_envs))
+    theta, callback = model.theta, Recorder(stop_at=7)
+    model.learn(10_000, callback)
+    assert callback.n_calls == 7 and model.num_timesteps == 7 * n_envs
+    assert th.equal(model.theta, theta) and callback.ends == 0
+    model.learn(100, reset_num_timesteps=False)
+    assert model.num_timesteps >= 100 + 7 * n_envs
+
+
+def test_callbacks_of_stable_baselines3(tmp_path: Any) -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 2))
+    evaluation = EvalCallback(VecNormalize(make_vec_env("CartPole-v1", 1), training=False), eval_freq=50, verbose=0)
+    saving = CheckpointCallback(100, str(tmp_path), save_vecnormalize=True)
+    model = make(env).learn(300, [evaluation, saving])
+    assert evaluation.n_calls > 0 and np.isfinite(evaluation.last_mean_reward)
+    checkpoint = FiniteDifference.load(next(tmp_path.glob("rl_model_*steps.zip")))
+    assert th.equal(checkpoint.theta, make(env).theta) and checkpoint.theta.shape == model.theta.shape
+    assert VecNormalize.load(str(next(tmp_path.glob("*vecnormalize*"))), make_vec_env("CartPole-v1", 2)).training
+    with warnings.catch_warnings():
+        # tqdm calls its own rich bar experimental
+        warnings.simplefilter("ignore")
+        model.learn(10_000, StopTrainingOnMaxEpisodes(5), progress_bar=True)
+    assert model.num_timesteps < 10_000
+
+
+def test_the_log() -> None:
+    written: dict[str, Any] = {}
+
+    class Writer(KVWriter):
+        def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
+            written.update(key_values)
+
+        def close(self) -> None:
+            pass
+
+    model = make(estimator="regression", n_delta=20)
+    model.set_logger(Logger(None, [Writer()]))
+    model.learn(200, log_interval=1)
+    train = "n_updates learning_rate delta_std grad_norm r_squared residual_std standard_error"
+    rollout = "ep_rew_mean ep_len_mean utility_mean utility_std"
+    clock = "iterations fps time_elapsed total_timesteps"
+    expected = {f"train/{key}" for key in train.split()} | {f"rollout/{key}" for key in rollout.split()}
+    assert written.keys() == expected | {f"time/{key}" for key in clock.split()}
+    assert all(np.isfinite(value) for value in written.values())
+    assert written["time/total_timesteps"] == model.num_timesteps
+    assert isinstance(model.ep_info_buffer, deque) and model.ep_info_buffer.maxlen == 100
+
+
+def test_the_same_seed_is_the_same_parameters() -> None:
+    first, again, other = (make(make_vec_env("CartPole-v1", 3), seed=seed).learn(500).theta for seed in (0, 0, 1))
+    assert th.equal(first, again)
+    assert not th.equal(first, other)
+
+
+@pytest.mark.parametrize("delta_std", [None, 0.1])
+def test_save_load_and_go_on_is_going_on(delta_std: float | None, tmp_path: Any) -> None:
+    model = make(make_vec_env("CartPole-v1", 2), delta_std=delta_std).learn(300)
+    model.save(tmp_path / "model")
+    loaded = FiniteDifference.load(tmp_path / "model", env=make_vec_env("CartPole-v1", 2), device="cpu")
+    assert th.equal(loaded.theta, model.theta)
+    for each in (model, loaded):
+        each.learn(300, reset_num_timesteps=False)
+    assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
+    assert th.equal(loaded.theta, model.theta)
+
+
+def test_schedules_end_at_zero_and_never_below() -> None:
+    seen: list[float] = []
+
+    def schedule(progress: float) -> float:
+        seen.append(progress)
+        return 0.1 * progress
+
+    model = make(learning_rate=schedule, delta_std=lambda progress: 0.01 + 0.1 * progress)
+    for _ in range(2):
+        model.learn(300, reset_num_timesteps=False)
+    assert min(seen) >= 0 and max(seen) <= 1
+    assert model._delta_std < 0.11
+
+
+def test_a_learning_rate_of_zero_leaves_theta_where_it_is() -> None:
+    model = make(learning_rate=0.0)
+    theta = model.theta
+    model.learn(200)
+    assert model._n_updates > 0 and th.equal(model.theta, theta)
+
+
+def test_common_random_numbers_reduce_the_variance_of_the_gradient() -> None:
+    def variance(common_random_numbers: bool) -> float:
+        model = make(Line(), common_random_numbers=common_random_numbers, n_delta=2, learning_rate=0.0, delta_std=0.1)
+        model._setup_learn(1)
+        model._prepare_search()
+        callback = Recorder_initialised(model)
+        return float(th.stack([model.estimate_gradient(callback) for _ in range(50)]).var())
+
+    assert variance(True) < variance(False) / 2
+
+
+def test_seeds_differ_from_update_to_update() -> None:
+    model = make(Line(), n_delta=1, learning_rate=0.0)
+    model._setup_learn(1)
+    model._prepare_search()
+    callback = Recorder_initialised(model)
+    assert len({float(model.estimate_gradient(callback)) for _ in range(3)}) == 3
+
+
+@pytest.mark.parametrize("norm_obs", [True, False])
+def test_vec_normalize_is_frozen_in_an_update_and_learns_between(norm_obs: bool) -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_obs=norm_obs)
+    counts: list[float] = []
+
+    class Frozen(BaseCallback):
+        def _on_step(self) -> bool:
+            assert env.training
+            counts.append(env.obs_rms.count if norm_obs else 0)
+            return True
+
+    model = make(env)
+    model.learn(1, Frozen())
+    assert len(set(counts)) == 1 and model._n_updates == 1 and env.training
+    if norm_obs:
+        assert env.obs_rms.count == pytest.approx(counts[0] + model.num_timesteps)
+        count = env.obs_rms.count
+        env.training = False
+        model.learn(1)
+        assert env.obs_rms.count == count and not env.training
+
+
+def test_utilities_are_sums_of_rewards_before_their_scaling() -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_reward=True)
+    model = make(env, n_delta=2).learn(1)
+    lengths = [float(utility) for utility in th.cat(model._utilities)]
+    assert all(length.is_integer() and length > 1 for length in lengths)
+    assert sorted(lengths) == sorted(episode["l"] for episode in model.ep_info_buffer)
+
+
+@pytest.mark.parametrize(
+    ("policy", "env"),
+    [
+        ("LinearPolicy", lambda: IdentityEnv(2)),
+        ("MlpPolicy", lambda: IdentityEnvBox()),
+        ("CnnPolicy", lambda: FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=True)),
+        ("MultiInputPolicy", lambda: SimpleMultiObsEnv(random_start=False)),
+    ],
+)
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_policies(policy: str, env: Any, deterministic: bool) -> None:
+    model = make(make_vec_env(env, 2), policy, n_delta=1, deterministic=deterministic)
+    model.learn(2)
+    assert model._n_updates == 1 and model.theta.shape == (model.n_parameters,)
+    assert np.isfinite(evaluate_policy(model, model.get_env(), 1)[0])
+
+
+def test_frame_stack_over_normalize() -> None:
+    env = VecFrameStack(VecNormalize(make_vec_env("CartPole-v1", 2)), 2)
+    assert make(env).learn(200).num_timesteps >= 200
+
+
+class Own(ActorCriticPolicy):
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        return super()._predict(observation, deterministic)
+
+
+def test_a_policy_with_code_of_its_own_gives_the_same_and_says_that_it_is_slower(capsys: Any) -> None:
+    thetas = []
+    for policy, verbose in (("MlpPolicy", 0), (Own, 1)):
+        model = make(make_vec_env("CartPole-v1", 2), policy, n_delta=2, verbose=verbose)
+        thetas.append(model.learn(100, log_interval=None).theta)
+    assert "Own has code of its own" in capsys.readouterr().out
+    th.testing.assert_close(*thetas)
+
+
+def test_too_few_perturbations_for_a_regression_are_said_once() -> None:
+    model = make(estimator="regression", n_delta=4)
+    with pytest.warns(UserWarning, match="n_delta=4 perturbations do not determine the gradient of 8"):
+        model.learn(1)
+    model.learn(1)
+
+
+def test_the_rule_of_thumb() -> None:
+    n = make().n_parameters
+    assert make(estimator="regression", n_delta=None).n_delta == 2 * n
+    assert make(estimator="central", n_delta=None).n_delta == n
+    assert make(policy="MlpPolicy", n_delta=None).n_delta == 64
+
+
+def test_a_perturbation_and_an_estimator_of_the_user() -> None:
+    def estimator(utility: Any, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
+        # Two calls: rows that are compared meet the same episodes
+        plus, minus = utility(theta + deltas), utility(theta - deltas)
+        return (plus - minus) @ deltas / (2 * (deltas**2).sum())
+
+    def perturbation(k: int, n: int, generator: th.Generator) -> th.Tensor:
+        return th.ones(k, n)
+
+    model = make(Line(), estimator=estimator, perturbation=perturbation, learning_rate=0.1).learn(2000)
+    assert float(model.theta) == pytest.approx(3, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "match"),
+    [
+        (dict(estimator="backward"), ValueError, "estimator must be .*'central'.* got 'backward'"),
+        (dict(estimator=3), TypeError, "estimator must be a name or a callable, got 3"),
+        (dict(perturbation="cube"), ValueError, "perturbation must be .*'sphere'.* got 'cube'"),
+        (dict(n_delta=0), ValueError, "n_delta must be at least 1, got 0"),
+        (dict(n_delta=1, estimator="regression"), ValueError, "n_delta must be at least 2, got 1"),
+        (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
+        (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
+        (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
+        (dict(delta_std=lambda progress: progress), ValueError, "delta_std .at progress 0. must be finite and > 0"),
+        (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
+        (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
+        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0, got -1"),
+        (dict(max_grad_norm=0), ValueError, "max_grad_norm must be finite and > 0, got 0"),
+        (dict(n_top=4), ValueError, "n_top=4 needs an n_delta of at least that, got n_delta=3"),
+        (dict(n_top=1, estimator="forward"), ValueError, "n_top=1 needs estimator='central'"),
+        (dict(policy="NoPolicy"), ValueError, "NoPolicy"),
+        (dict(policy=th.nn.Linear), TypeError, "policy must be a name or a subclass of ActorCriticPolicy"),
+    ],
+)
+def test_bad_arguments_are_named(kwargs: dict[str, Any], error: type[Exception], match: str) -> None:
+    with pytest.raises(error, match=match):
+        make(**kwargs)
+
+
+def test_bad_arguments_of_learn_are_named() -> None:
+    for kwargs in (dict(total_timesteps=float("nan")), dict(total_timesteps=10, log_interval=0)):
+        with pytest.raises(ValueError, match=str(list(kwargs)[-1])):
+            make().learn(**kwargs)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Tuple([spaces.Discrete(2)]), spaces.Text(3), spaces.Sequence(spaces.Discrete(2))]
+)
+def test_unsupported_spaces_are_an_error(space: spaces.Space) -> None:
+    class Odd(Line):
+        pass
+
+    for name in ("observation_space", "action_space"):
+        env = Odd()
+        setattr(env, name, space)
+        with pytest.raises(ValueError, match=f"{name.split('_')[0]} space must be"):
+            make(DummyVecEnv([lambda env=env: env]) if name == "action_space" else env)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "match"),
+    [
+        (dict(estimator=lambda u, t, d: t[:1]), r"estimator must return a tensor of shape \(8,\), got .*\(1,\)"),
+        (dict(estimator=lambda u, t, d: 3.0), r"estimator must return a tensor of shape \(8,\), got 3.0"),
+        (dict(estimator=lambda u, t, d: t * np.nan), "estimator must return finite numbers"),
+        (dict(estimator=lambda u, t, d: t), "estimator must call the utility at least once"),
+        (dict(estimator=lambda u, t, d: u(t)), r"candidates must be a tensor of shape \(k, 8\) or \(m, k, 8\)"),
+        (dict(perturbation=lambda k, n, g: th.ones(n, k)), r"perturbation must return a tensor of shape \(3, 8\)"),
+        (dict(perturbation=lambda k, n, g: th.full((k, n), th.inf)), "perturbation must return finite numbers"),
+        (dict(perturbation=lambda k, n, g: th.zeros(k, n)), "no usable direction"),
+        (
+            dict(estimator="regression", n_delta=9, perturbation=lambda k, n, g: th.ones(k, n)),
+            "no usable direction",
+        ),
+        (dict(max_episode_steps=3), "has not ended after max_episode_steps=3 steps"),
+    ],
+)
+def test_what_a_user_returns_wrongly_is_named_and_theta_stays(kwargs: dict[str, Any], match: str) -> None:
+    model = make(**kwargs)
+    theta = model.theta
+    with pytest.raises(ValueError, match=match):
+        model.learn(100)
+    assert th.equal(model.theta, theta) and model._n_updates == 0
+
+
+class Failing(gym.Wrapper):
+    """Goes wrong in the given way at its 100th step."""
+
+    def __init__(self, env: gym.Env, how: str):
+        super().__init__(env)
+        self.how, self.steps = how, 0
+
+    def step(self, action: Any) -> Any:
+        obs, reward, *rest = super().step(action)
+        self.steps += 1
+        if self.steps == 100:
+            if self.how == "interrupt":
+                raise KeyboardInterrupt
+            if self.how == "exception":
+                raise RuntimeError("the simulator broke")
+            return obs, np.nan, *rest
+        return obs, reward, *rest
+
+
+@pytest.mark.parametrize(
+    ("how", "error"), [("interrupt", KeyboardInterrupt), ("exception", RuntimeError), ("nan", ValueError)]
+)
+def test_theta_is_the_last_good_one_after_a_failure_and_can_be_saved(
+    how: str, error: type[BaseException], tmp_path: Any
+) -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 1, wrapper_class=Failing, wrapper_kwargs=dict(how=how)))
+    model = make(env)
+    callback = Recorder()
+    with pytest.raises(error):
+        model.learn(10_000, callback)
+    assert th.equal(model.theta, callback.centre) and env.training
+    model.save(tmp_path / "model")
+    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, callback.centre)
+    assert model.learn(200).num_timesteps >= 200
+
+
+@pytest.mark.parametrize("killed", [0, 1])
+@pytest.mark.parametrize("start_method", ["forkserver", "fork"])
+def test_a_dead_worker_ends_training_promptly(start_method: str, killed: int, tmp_path: Any) -> None:
+    with warnings.catch_warnings():
+        # Python warns of fork beside threads; here it is what is tested
+        warnings.simplefilter("ignore", DeprecationWarning)
+        env = SubprocVecEnv([lambda: gym.make("CartPole-v1")] * 2, start_method=start_method)
+    model = make(env)
+
+    class Kill(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls == 20:
+                os.kill(env.processes[killed].pid, signal.SIGKILL)
+                env.processes[killed].join()
+            return True
+
+    # A hang would otherwise hold up the whole test run
+    watchdog = threading.Timer(60, env.processes[1 - killed].kill)
+    watchdog.start()
+    begun = time.monotonic()
+    with pytest.raises(ConnectionError, match=f"worker of environment {killed} died"):
+        model.learn(10_000, Kill())
+    watchdog.cancel()
+    assert time.monotonic() - begun < 50
+    model.save(tmp_path / "model")
+    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, model.theta)
+    env.processes[1 - killed].kill()
+    env.closed = True
+
+
+def test_policy_kwargs_are_not_written_to() -> None:
+    policy_kwargs = dict(optimizer_class=th.optim.SGD)
+    make(policy_kwargs=policy_kwargs)
+    assert policy_kwargs == dict(optimizer_class=th.optim.SGD)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_it_learns_cart_pole(seed: int) -> None:
+    model = FiniteDifference("LinearPolicy", make_vec_env("CartPole-v1", 1, seed=seed), seed=seed, device="cpu")
+    assert evaluate_policy(model.learn(50_000), model.get_env(), 50)[0] >= 475

@@ -1,0 +1,91 @@
+"""θ as a vector: the actor's parameters, all of them and no others, with nothing lost on the way."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
+
+from sb3_reinforce import REINFORCE, FiniteDifference, parameters
+from sb3_reinforce.linear_policy import LinearPolicy
+
+OBS, ACTIONS = spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,))
+
+
+def make(policy_class: type[ActorCriticPolicy], obs: spaces.Space = OBS, **kwargs: object) -> ActorCriticPolicy:
+    return policy_class(obs, ACTIONS, lambda _: 1e-3, **kwargs)
+
+
+def names(policy: ActorCriticPolicy) -> set[str]:
+    actor = {id(parameter) for parameter in parameters.actor_parameters(policy)}
+    return {name for name, parameter in policy.named_parameters() if id(parameter) in actor}
+
+
+def test_theta_is_the_actor_without_critic_and_log_std() -> None:
+    assert names(make(LinearPolicy)) == {"action_net.weight"}
+    mlp = names(make(ActorCriticPolicy))
+    layers = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
+    assert mlp == {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+
+
+def test_a_shared_features_extractor_is_part_of_the_actor() -> None:
+    policy = make(ActorCriticCnnPolicy, spaces.Box(0, 255, (3, 36, 36), np.uint8))
+    extractor = {name for name, _ in policy.named_parameters() if name.startswith("features_extractor")}
+    assert extractor and extractor < names(policy)
+    assert not any("value" in name for name in names(policy))
+
+
+def test_read_and_write_are_an_exact_round_trip() -> None:
+    policy = make(ActorCriticPolicy)
+    actor = parameters.actor_parameters(policy)
+    before, theta = policy.state_dict(), parameters.read(actor)
+    before = {name: value.clone() for name, value in before.items()}
+    assert theta.dtype == th.float64 and theta.shape == (sum(p.numel() for p in actor),)
+    parameters.write(actor, th.zeros_like(theta))
+    assert all((p == 0).all() for p in actor)
+    assert th.equal(policy.value_net.weight, before["value_net.weight"])
+    parameters.write(actor, theta)
+    assert all(th.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
+def test_split_is_the_inverse_of_read() -> None:
+    actor = parameters.actor_parameters(make(ActorCriticPolicy))
+    thetas = th.randn(3, len(parameters.read(actor)), generator=th.Generator().manual_seed(0)).float().double()
+    parts = parameters.split(thetas, actor)
+    assert [part.shape for part in parts] == [(3, *p.shape) for p in actor]
+    for i, theta in enumerate(thetas):
+        assert th.equal(parameters.read([part[i] for part in parts]), theta)
+
+
+def test_an_actor_without_trainable_parameters_is_an_error() -> None:
+    policy = make(LinearPolicy)
+    policy.action_net.requires_grad_(False)
+    with pytest.raises(ValueError, match="no trainable parameters"):
+        parameters.actor_parameters(policy)
+
+
+def test_linear_policy_refuses_hidden_layers() -> None:
+    with pytest.raises(ValueError, match=r"net_arch=\[8\]"):
+        make(LinearPolicy, net_arch=[8])
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
+    reinforce = REINFORCE("MlpPolicy", env_id, seed=0)
+    search = FiniteDifference("MlpPolicy", env_id, estimator="central", n_delta=1, seed=1)
+    obs = gym.make(env_id).observation_space.sample()
+
+    def actions() -> list[np.ndarray]:
+        return [model.predict(obs, deterministic=True)[0] for model in (reinforce, search)]
+
+    search.set_parameters(reinforce.get_parameters(), exact_match=False)
+    assert np.array_equal(*actions())
+    assert th.equal(search.theta, parameters.read(parameters.actor_parameters(reinforce.policy)))
+    search.learn(1)
+    reinforce.set_parameters(search.get_parameters(), exact_match=False)
+    assert np.array_equal(*actions())
+    reinforce.save(tmp_path / "model")
+    other = FiniteDifference("MlpPolicy", env_id, estimator="central", n_delta=1, seed=2)
+    other.set_parameters(str(tmp_path / "model"), exact_match=False)
+    assert th.equal(other.theta, search.theta)
