@@ -7,6 +7,7 @@ This module hands on the public names of its rooms.
 from sb3_reinforce.comparisons import BaselineRow, compare_baselines
 from sb3_reinforce.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.gradient_statistics import Estimate, GradientStatistics, gradient_statistics
+from sb3_reinforce.quality_callbacks import GradientQualityCallback
 from sb3_reinforce.sampling import sample
 from sb3_reinforce.scores import gradients_by_episode
 from sb3_reinforce.tables import Table
@@ -16,6 +17,7 @@ __all__ = [
     "CheckRow",
     "CheckTable",
     "Estimate",
+    "GradientQualityCallback",
     "GradientStatistics",
     "Table",
     "check_gradient",

@@ -1,0 +1,122 @@
+"""The quality of the gradient, logged while a model trains."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import cast
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_reinforce.arguments import check_integer
+from sb3_reinforce.baselines import Baseline
+from sb3_reinforce.collection import by_step
+from sb3_reinforce.comparisons import functions_of, gram
+from sb3_reinforce.gradient_statistics import moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.policies import Parameters, as_policy_actions
+from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.rollouts import Rollout, flatten, take
+from sb3_reinforce.sampling import check_model
+from sb3_reinforce.scores import gradients_by_episode, score_parameters
+from sb3_reinforce.weighing import check_baseline
+
+
+class GradientQualityCallback(BaseCallback):
+    """
+    Logs how noisy the gradient is, from the rollouts that training collects anyway.
+
+    Every ``every`` rollouts:
+
+    - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient with its own weights;
+    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, in episodes: rollouts of that many are as much signal as noise;
+    - ``gradient/variance/<baseline>``: tr Σ of one episode, for each of ``baselines`` on the same episodes;
+    - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
+
+    A sample g is the gradient of one episode, or of the part of it that a fixed rollout holds. The estimates are those
+    of a single rollout, and noisy where it has few episodes; with fewer than two there is nothing to log. The cost is
+    about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, divided by
+    ``every``; nothing is sampled for it, and training is the same with and without it.
+
+    :param every: Rollouts between two measurements
+    :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
+    :param max_episodes: Episodes of a rollout that are looked at
+    :param verbose: Verbosity level
+    :raises TypeError: If an argument is of the wrong kind, or the model is not a REINFORCE
+    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic
+    """
+
+    def __init__(
+        self,
+        every: int = 10,
+        baselines: Iterable[str | Baseline] = ("none", "time_mean"),
+        max_episodes: int = 64,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        self.every = check_integer("every", every, 1)
+        self.max_episodes = check_integer("max_episodes", max_episodes, 2)
+        self.baselines = baselines
+        self.n_rollouts = 0
+        self.thetas: list[th.Tensor] = []
+        self.parameters: Parameters = []
+
+    def _init_callback(self) -> None:
+        check_model(self.model)
+        self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        rollout = cast(Rollout, cast(REINFORCE, self.model)._rollout)
+        if not self.parameters:
+            step = th.arange(1)
+            actions = as_policy_actions(take(flatten(rollout.actions), step), self.model.action_space)
+            self.parameters = score_parameters(rollout.policy, take(flatten(rollout.observations), step), actions)
+        self.thetas = [*self.thetas[-2:], th.nn.utils.parameters_to_vector(self.parameters).detach().clone()]
+        self.n_rollouts += 1
+        if self.n_rollouts % self.every == 0:
+            for key, figure in self.measure(rollout).items():
+                self.logger.record(f"gradient/{key}", figure)
+
+    def measure(self, rollout: Rollout) -> dict[str, float]:
+        """
+        The figures of one rollout.
+
+        :param rollout: The rollout, before training on it
+        """
+        figures = {}
+        if len(self.thetas) == 3:
+            before, after = self.thetas[1] - self.thetas[0], self.thetas[2] - self.thetas[1]
+            figures["cosine"] = float(th.cosine_similarity(before, after, dim=0))
+        n_episodes = len(th.unique(rollout.episodes[rollout.used]))
+        if n_episodes < 2:
+            return figures
+        buffer = cast(REINFORCE, self.model).rollout_buffer
+        weights = {"": th.as_tensor(by_step(buffer, buffer.advantages)).double() * rollout.discounts}
+        for name, function in self.functions.items():
+            baseline = th.as_tensor(check_baseline(function(rollout), rollout))
+            weights[name] = rollout.discounts * (rollout.returns - baseline)
+        rollout = first_episodes(rollout, self.max_episodes)
+        ones = th.ones(1, min(n_episodes, self.max_episodes), dtype=th.float64)
+        for name, gradients in zip(weights, gradients_by_episode(rollout, *weights.values()), strict=True):
+            found = moments(gram(gradients), ones)
+            if name:
+                figures[f"variance/{name}"] = float(variance(found))
+            else:
+                figures["snr"] = n_episodes * float(signal_to_noise(found))
+                figures["noise_scale"] = float(noise_scale(found))
+        return figures
+
+
+def first_episodes(rollout: Rollout, n_episodes: int) -> Rollout:
+    """
+    A rollout of which only so many episodes are used, taken evenly from the environments.
+
+    :param rollout: The rollout
+    :param n_episodes: Their number
+    """
+    numbers = th.unique(rollout.episodes[rollout.used])
+    if len(numbers) <= n_episodes:
+        return rollout
+    kept = numbers[th.linspace(0, len(numbers) - 1, n_episodes).round().long()]
+    return replace(rollout, used=rollout.used & th.isin(rollout.episodes, kept))
