@@ -5,8 +5,10 @@ This module hands on the public names of its rooms.
 """
 
 from sb3_reinforce.comparisons import BaselineRow, compare_baselines
+from sb3_reinforce.estimator_comparison import EstimatorRow, compare_estimators
 from sb3_reinforce.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.gradient_statistics import Estimate, GradientStatistics, gradient_statistics
+from sb3_reinforce.landscapes import Landscape, landscape
 from sb3_reinforce.quality_callbacks import GradientQualityCallback
 from sb3_reinforce.sampling import sample
 from sb3_reinforce.scores import gradients_by_episode
@@ -17,12 +19,16 @@ __all__ = [
     "CheckRow",
     "CheckTable",
     "Estimate",
+    "EstimatorRow",
     "GradientQualityCallback",
     "GradientStatistics",
+    "Landscape",
     "Table",
     "check_gradient",
     "compare_baselines",
+    "compare_estimators",
     "gradient_statistics",
     "gradients_by_episode",
+    "landscape",
     "sample",
 ]

@@ -2,9 +2,12 @@
 
 import copy
 from collections import deque
-from typing import Any, TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
@@ -67,22 +70,36 @@ def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | Non
     sampler.rollout_buffer = model.rollout_buffer_class(  # type: ignore[misc]
         1, env.observation_space, env.action_space, model.device, n_envs=env.num_envs, **model.rollout_buffer_kwargs
     )
-    callback, normalize = Infos(), model.get_vec_normalize_env()
+    callback = Infos()
     callback.init_callback(sampler)
+    with undisturbed(model):
+        sampler._last_obs = env.reset()  # type: ignore[assignment]
+        sampler._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        sampler.collect_rollouts(env, callback, sampler.rollout_buffer, None)
+    return sampler, callback
+
+
+@contextmanager
+def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
+    """
+    Use a model's environments in the block; the statistics of a VecNormalize stay as they are.
+
+    :param model: The model; in the middle of training too, it then goes on from the start of an episode
+    """
+    env, normalize = cast(VecEnv, model.env), model.get_vec_normalize_env()
     training = normalize is not None and normalize.training
     try:
         if normalize is not None:
             normalize.training = False
-        sampler._last_obs = env.reset()  # type: ignore[assignment]
-        sampler._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-        sampler.collect_rollouts(env, callback, sampler.rollout_buffer, None)
-    finally:
-        # In the middle of training too, the model goes on from the start of an episode
+        yield
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+    except Exception:
+        model._last_obs = None
+        raise
+    finally:
         if normalize is not None:
             normalize.training = training
-    return sampler, callback
 
 
 def check_model(model: Any) -> VecEnv:

@@ -1,0 +1,199 @@
+"""The families of gradient estimators at one θ: which of them sees the gradient of a task from the fewest steps."""
+
+import copy
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import cast
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce import baselines
+from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.comparisons import UNKNOWN, gram
+from sb3_reinforce.estimators import ESTIMATORS
+from sb3_reinforce.finite_difference import FiniteDifference
+from sb3_reinforce.gradient_statistics import Estimate, cosine, interval, moments, resamples, signal_to_noise
+from sb3_reinforce.landscapes import CandidateUtility
+from sb3_reinforce.parameters import actor_parameters
+from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.policies import Parameters, as_policy_actions
+from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.rollouts import Rollout, flatten, take
+from sb3_reinforce.sampling import sampled
+from sb3_reinforce.scores import gradients_by_episode, score_parameters
+from sb3_reinforce.search_settings import default_delta_std, default_n_delta
+from sb3_reinforce.tables import Table
+
+LIKELIHOOD_RATIO = "likelihood_ratio"
+
+
+@dataclass(frozen=True)
+class EstimatorRow:
+    """
+    One estimator of the gradient of ``U(θ) = E[Σ_t r_t]``.
+
+    :param estimator: Its name
+    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient of other episodes
+    :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, by the environment steps behind it
+    :param steps: Environment steps behind one estimate, of all environments
+    :param seconds: Time behind one estimate
+    """
+
+    estimator: str
+    cosine: Estimate
+    snr_per_step: Estimate
+    steps: float
+    seconds: float
+
+
+def compare_estimators(
+    model: REINFORCE | FiniteDifference,
+    n_episodes: int = 100,
+    n_estimates: int = 10,
+    estimators: Iterable[str] = (LIKELIHOOD_RATIO, "forward", "central", "regression"),
+    perturbation: str | Perturbation = "gaussian",
+    n_delta: int | None = None,
+    delta_std: float | None = None,
+    n_resamples: int = 500,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Table[EstimatorRow]:
+    """
+    Estimate the gradient at the model's θ by each family, with the same sampling policy and γ = 1.
+
+    θ is the actor's parameters without ``log_std``. An estimate is, for the likelihood ratio, one episode with
+    reward-to-go and the leave-one-out baseline; for the others, ``n_delta`` perturbations with one episode each behind
+    a utility. The signal-to-noise ratio of a mean of estimates is proportional to their number, so its ratio to the
+    steps does not depend on how large an estimate is. With fewer perturbations than parameters a difference sees only
+    their span: its expectation is a multiple of the gradient, and the cosine is that of the expectation.
+
+    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param n_episodes: Episodes of the likelihood ratio, and as many again for the gradient to compare with, at least 3
+    :param n_estimates: Estimates by each of the others, at least 3
+    :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
+    :param perturbation: As for FiniteDifference
+    :param n_delta: As for FiniteDifference; None for the rule of thumb
+    :param delta_std: As for FiniteDifference; None for the rule of thumb
+    :param n_resamples: Bootstrap resamples behind the intervals
+    :param confidence: Probability that an interval is to cover the truth
+    :param seed: Seed of perturbations, episodes and resamples
+    :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
+    :raises ValueError: If an argument is out of its range, a name is unknown, or the model has no environment
+    """
+    if not isinstance(model, REINFORCE | FiniteDifference):
+        raise TypeError(f"model must be a REINFORCE or FiniteDifference, got {model!r} of type {type(model).__name__}")
+    names = tuple(estimators)
+    for name in names:
+        check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
+    check_integer("n_episodes", n_episodes, 3)
+    check_integer("n_estimates", n_estimates, 3)
+    check_integer("n_resamples", n_resamples, 1)
+    check_number("confidence", confidence, 0, 1)
+    utility = CandidateUtility(model, 1, seed)
+    draw = check_function("perturbation", perturbation, PERTURBATIONS)
+    scale = (
+        default_delta_std(utility.theta) if delta_std is None else check_number("delta_std", delta_std, 0, above=True)
+    )
+    generator = th.Generator().manual_seed(seed)
+
+    def difference(name: str) -> Callable[[], tuple[th.Tensor, int]]:
+        k = default_n_delta(name, len(utility.theta)) if n_delta is None else check_integer("n_delta", n_delta, 2)
+
+        def estimate() -> tuple[th.Tensor, int]:
+            before = utility.n_steps
+            deltas = scale * draw(k, len(utility.theta), generator)
+            return ESTIMATORS[name](utility, utility.theta, deltas), utility.n_steps - before
+
+        return estimate
+
+    reference = likelihood_ratio(model, n_episodes)[0]
+    rows = []
+    for name in names:
+        begin = time.perf_counter()
+        if name == LIKELIHOOD_RATIO:
+            gradients, n_steps = likelihood_ratio(model, n_episodes)
+        else:
+            estimate = difference(name)
+            found, steps = zip(*(estimate() for _ in range(n_estimates)), strict=True)
+            gradients, n_steps = th.stack(found), sum(steps)
+        seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
+        rows.append(estimator_row(name, gradients, reference, n_steps / len(gradients), seconds, counts, confidence))
+    return Table(f"Gradient of U(θ) for {len(utility.theta)} parameters by estimator", rows)
+
+
+def estimator_row(
+    name: str,
+    gradients: th.Tensor,
+    reference: th.Tensor,
+    steps: float,
+    seconds: float,
+    counts: th.Tensor,
+    confidence: float,
+) -> EstimatorRow:
+    """
+    A row of ``compare_estimators``.
+
+    :param name: The estimator
+    :param gradients: Its m estimates, shape ``(m, n)``, float64
+    :param reference: Likelihood-ratio gradients of other episodes, shape ``(m', n)``, float64
+    :param steps: Environment steps behind one estimate
+    :param seconds: Time behind all estimates
+    :param counts: Resamples of the estimates, shape ``(r, m)``
+    :param confidence: Probability that an interval is to cover the truth
+    """
+    found = moments(gram(gradients), counts)
+    ratio = interval(signal_to_noise(found) / steps, confidence)
+    to_reference = UNKNOWN
+    # The norm of the reference without its noise, which would make every cosine too small
+    squared = float(moments(gram(reference), th.ones(1, len(reference), dtype=th.float64)).signal)
+    if squared > 0:
+        products = counts @ (gradients @ reference.mean(0)) / counts.sum(1) / squared**0.5
+        to_reference = interval(cosine(found, products), confidence)
+    return EstimatorRow(name, to_reference, ratio, steps, seconds / len(gradients))
+
+
+def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:
+    """
+    Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``.
+
+    :param model: The model
+    :param n_episodes: Number of episodes
+    :return: Shape ``(n_episodes, n)``, float64; and the environment steps that they took, of all environments
+    """
+    plain = as_reinforce(model)
+    sampler, infos = sampled(plain, n_episodes, "leave_one_out")
+    rollout = cast(Rollout, sampler._rollout)
+    baseline = baselines.leave_one_out(rollout)
+    gradients = gradients_by_episode(rollout, rollout.returns - baseline)[0].double().cpu()
+    step = th.arange(1)
+    actions = as_policy_actions(take(flatten(rollout.actions), step), plain.action_space)
+    scored: Parameters = score_parameters(plain.policy, take(flatten(rollout.observations), step), actions)
+    wanted = {id(parameter) for parameter in actor_parameters(plain.policy)}
+    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored])
+    return gradients[:, mask], len(infos.infos) * cast(VecEnv, plain.env).num_envs
+
+
+def as_reinforce(model: BaseAlgorithm) -> REINFORCE:
+    """
+    A REINFORCE at γ = 1 with a model's policy and environments, which keeps nothing of its own.
+
+    :param model: A REINFORCE or FiniteDifference
+    """
+    if isinstance(model, REINFORCE):
+        plain = copy.copy(model)
+    else:
+        plain = REINFORCE(
+            type(model.policy),  # type: ignore[arg-type]
+            cast(VecEnv, model.env),
+            policy_kwargs=model.policy_kwargs,
+            max_episode_steps=getattr(model, "max_episode_steps", 100_000),
+            device=model.device,
+        )
+        plain.policy = cast(ActorCriticPolicy, model.policy)
+    plain.gamma, plain.gae_lambda, plain.reward_to_go, plain.discount_scores = 1.0, 1.0, True, False
+    plain.baseline = "leave_one_out"
+    return plain

@@ -1,0 +1,162 @@
+"""The performance landscape: U(θ) on a plane through the parameters of a policy, and the steps that estimators take."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce import parameters
+from sb3_reinforce.arguments import check_integer, check_number
+from sb3_reinforce.candidate_actors import make_actor
+from sb3_reinforce.candidates import Step, evaluate
+from sb3_reinforce.sampling import undisturbed
+
+
+class CandidateUtility:
+    """
+    ``U(θ) = E[Σ_t r_t]`` of parameter vectors, by the mean return of episodes in a model's environments.
+
+    The policy samples its actions, so that this is the utility whose gradient REINFORCE estimates at γ = 1. All
+    candidates of a call start from the same seeds; each call has new ones.
+
+    :param model: A model with an actor-critic policy and environments
+    :param n_episodes: Episodes behind each utility
+    :param seed: Seed of the first episode
+    :raises TypeError: If the model has no actor-critic policy
+    :raises ValueError: If it has no environments
+    """
+
+    def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
+        if not isinstance(getattr(model, "policy", None), ActorCriticPolicy):
+            raise TypeError(f"model must have an actor-critic policy, got {model!r} of type {type(model).__name__}")
+        if model.env is None:
+            raise ValueError("model must have an environment to sample episodes from: call set_env first")
+        self.model, self.n_episodes = model, check_integer("n_episodes", n_episodes, 1)
+        self.seed, self.n_steps = check_integer("seed", seed, 0), 0
+        policy = cast(ActorCriticPolicy, model.policy)
+        policy.set_training_mode(False)
+        self.parameters = parameters.actor_parameters(policy)
+        self.theta = parameters.read(self.parameters)
+        self.actor = make_actor(policy, self.parameters, model.env.num_envs, deterministic=False)
+
+    def __call__(self, thetas: th.Tensor) -> th.Tensor:
+        """
+        The utilities.
+
+        :param thetas: Shape ``(k, n)``, or ``(m, k, n)``
+        :return: Shape ``(k,)`` or ``(m, k)``, float64
+        """
+        candidates = thetas.reshape(-1, len(self.theta))
+        seeds = np.broadcast_to(self.seed + np.arange(self.n_episodes), (len(candidates), self.n_episodes))
+        self.seed += self.n_episodes
+        limit = getattr(self.model, "max_episode_steps", 100_000)
+        env, normalize = cast(VecEnv, self.model.env), self.model.get_vec_normalize_env()
+        with undisturbed(self.model):
+            returns = evaluate(self.actor, env, candidates, seeds, self.n_episodes, limit, self.count, normalize)
+        return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
+
+    def count(self, step: Step) -> None:
+        """
+        Count the steps of all environments, those of idle ones too.
+
+        :param step: A step
+        """
+        self.n_steps += len(step.dones)
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """
+    ``U(θ + x d_1 + y d_2)`` on a grid.
+
+    :param scales: The values of x and of y, shape ``(s,)``
+    :param utilities: Shape ``(s, s)``: the row is y, the column is x
+    :param steps: By name, the (x, y) of the gradients' projections on the plane, of length 1 in the largest scale
+    """
+
+    scales: np.ndarray
+    utilities: np.ndarray
+    steps: dict[str, np.ndarray]
+
+
+def landscape(
+    model: BaseAlgorithm,
+    gradients: dict[str, th.Tensor] | None = None,
+    directions: th.Tensor | None = None,
+    extent: float = 1.0,
+    n_points: int = 11,
+    n_episodes: int = 5,
+    seed: int = 0,
+) -> Landscape:
+    """
+    Evaluate the utility on a plane through θ.
+
+    :param model: A model with an actor-critic policy; it is not changed
+    :param gradients: Gradients of the actor's parameters to draw, by name, each of shape ``(n,)``
+    :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,
+        normalised filter by filter (Li et al., 2018, section 4)
+    :param extent: Half the width of the plane, in directions
+    :param n_points: Points along each side
+    :param n_episodes: Episodes behind each point
+    :param seed: Seed of the directions and of the episodes
+    :raises ValueError: If an argument is out of its range or of the wrong shape
+    """
+    check_number("extent", extent, 0, above=True)
+    check_integer("n_points", n_points, 2)
+    utility = CandidateUtility(model, n_episodes, seed)
+    n = len(utility.theta)
+    if directions is None:
+        drawn = th.randn(2, n, dtype=th.float64, generator=th.Generator().manual_seed(seed))
+        plane = th.stack([filter_normalized(direction, utility.parameters) for direction in drawn])
+    else:
+        check_direction("directions", directions, (2, n))
+        plane = directions.double() / directions.double().norm(dim=1, keepdim=True) * utility.theta.norm()
+    scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
+    grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
+    utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
+    steps = {}
+    for name, gradient in (gradients or {}).items():
+        check_direction(f"gradients[{name!r}]", gradient, (n,))
+        projection = th.linalg.lstsq(plane.T, gradient.double()[:, None]).solution[:, 0]
+        steps[name] = (extent * projection / projection.norm().clamp(min=1e-300)).numpy()
+    return Landscape(scales.numpy(), utilities.numpy(), steps)
+
+
+def check_direction(name: str, direction: th.Tensor, shape: Sequence[int]) -> None:
+    """
+    Check a direction in the space of parameters.
+
+    :param name: Its name, for the message
+    :param direction: The direction
+    :param shape: Its shape
+    :raises ValueError: If it is of another shape, not finite, or zero
+    """
+    norms = direction.double().norm(dim=-1)
+    if direction.shape != th.Size(shape) or not bool((norms.isfinite() & (norms > 0)).all()):
+        raise ValueError(
+            f"{name} must be finite, not zero and of shape {tuple(shape)}, got shape {tuple(direction.shape)} and norm "
+            f"{norms.tolist()}"
+        )
+
+
+def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    ``d_f ← d_f ‖θ_f‖ / ‖d_f‖`` for each filter f: a row of a weight matrix, or a whole bias.
+
+    Without it, the scale of a layer, which a later layer can undo, would decide how steep the landscape looks.
+    Source: Li et al. (2018), "Visualizing the loss landscape of neural nets", section 4.
+
+    :param direction: Shape ``(n,)``
+    :param like: The parameters θ, with n elements in all
+    :return: Shape ``(n,)``
+    """
+    parts = th.split(direction, [parameter.numel() for parameter in like])
+    filters = [(d.reshape(len(p) if p.dim() > 1 else 1, -1), p) for d, p in zip(parts, like, strict=True)]
+    norm = partial(th.linalg.vector_norm, dim=1, keepdim=True)
+    return th.cat([(d / norm(d) * norm(p.detach().cpu().double().reshape(d.shape))).flatten() for d, p in filters])

@@ -1,0 +1,165 @@
+"""Utilities on a plane, estimators at one θ, and the pictures of what was measured."""
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor, Tree
+from stable_baselines3 import DQN
+from stable_baselines3.common.env_util import make_vec_env
+from test_enumeration import make_model, true_gradient
+
+from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
+from sb3_reinforce.estimator_comparison import likelihood_ratio
+from sb3_reinforce.landscapes import CandidateUtility, filter_normalized
+
+
+def bandit(algorithm=REINFORCE, **kwargs):
+    """Action 1 is worth 1, action 0 nothing: U = π(1), whatever the observation."""
+    env = make_vec_env(lambda: Corridor((1,), lambda t, action: float(action)), 8, seed=0)
+    return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0, **kwargs)
+
+
+def test_the_utility_is_that_of_the_sampling_policy():
+    model = bandit()
+    utility = CandidateUtility(model, 500, seed=0)
+    thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0])
+    with th.no_grad():
+        logits = model.policy.action_net(th.ones(1, 1))[0]
+    shift = float(logits[1] - logits[0])
+    expected = [1 / (1 + np.exp(-shift - 2.0 * x)) for x in (0, 1, -1)]
+    np.testing.assert_allclose(utility(thetas).numpy(), expected, atol=0.08)
+    assert utility.n_steps >= 1500
+    assert utility(thetas.reshape(1, 3, -1)).shape == (1, 3)
+
+
+def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
+    """Asked of a model with γ = ½, which is set aside."""
+    gradients, n_steps = likelihood_ratio(make_model(), 4000)
+    truth = true_gradient(Tree().trajectories(), lambda episode: sum(reward for _, _, reward in episode))
+    assert gradients.shape == (4000, 6)
+    assert n_steps == 8000
+    error = gradients.mean(0) - truth.T.flatten()
+    assert (error.abs() <= 4.5 * gradients.std(0) / 4000**0.5).all()
+
+
+@pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])
+def test_all_estimators_see_the_same_gradient(algorithm):
+    model = bandit(algorithm)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    table = compare_estimators(model, 200, 60, perturbation="sphere", n_delta=16, delta_std=1.0)
+    assert table.names == ["likelihood_ratio", "forward", "central", "regression"]
+    assert all(row.cosine.high > 0.95 for row in table)
+    assert table["likelihood_ratio"].cosine.low > 0.9
+    assert table["likelihood_ratio"].steps == 1
+    assert [table[name].steps >= evaluations for name, evaluations in (("forward", 17), ("central", 32))] == [True] * 2
+    assert table["likelihood_ratio"].snr_per_step.low > 0
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+    model.learn(32)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_episodes": 2}, "n_episodes must be at least 3"),
+        ({"n_estimates": 1}, "n_estimates must be at least 3"),
+        ({"estimators": ("backward",)}, r"estimators must be one of.*'backward'"),
+        ({"delta_std": 0.0}, "delta_std"),
+        ({"n_delta": 1}, "n_delta must be at least 2"),
+        ({"perturbation": "cube"}, "perturbation must be"),
+        ({"confidence": 95}, "confidence"),
+    ],
+)
+def test_a_users_mistake_is_named(kwargs, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        compare_estimators(bandit(), **kwargs)
+
+
+def test_other_models_are_refused():
+    model = DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=10)
+    with pytest.raises(TypeError, match="REINFORCE or FiniteDifference"):
+        compare_estimators(model)
+    with pytest.raises(TypeError, match="actor-critic policy"):
+        landscape(model)
+
+
+def test_a_landscape_rises_along_the_gradient():
+    model = bandit()
+    with th.no_grad():
+        model.policy.action_net.weight.fill_(1.0)
+    gradient = likelihood_ratio(model, 200)[0].mean(0)
+    across = th.tensor([1.0, 1.0, 0.0, 0.0], dtype=th.float64)
+    found = landscape(model, {"ĝ": gradient}, th.stack([gradient, across]), extent=3.0, n_points=5, n_episodes=60)
+    assert found.utilities.shape == (5, 5)
+    assert (found.utilities[:, -1] > found.utilities[:, 0]).all()
+    assert np.ptp(found.utilities.mean(axis=1)) < 0.2
+    assert found.steps["ĝ"][0] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_directions_are_normalized_filter_by_filter():
+    like = [th.nn.Parameter(th.randn(3, 4)), th.nn.Parameter(th.randn(3))]
+    direction = filter_normalized(th.randn(15, dtype=th.float64), like)
+    th.testing.assert_close(direction[:12].reshape(3, 4).norm(dim=1), like[0].double().norm(dim=1).detach())
+    th.testing.assert_close(direction[12:].norm(), like[1].double().norm().detach())
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"extent": 0}, "extent"),
+        ({"n_points": 1}, "n_points"),
+        ({"n_episodes": 0}, "n_episodes"),
+        ({"directions": th.ones(2, 3)}, r"directions.*\(2, 4\).*\(2, 3\)"),
+        ({"gradients": {"g": th.zeros(4)}}, r"gradients\['g'\].*not zero"),
+    ],
+)
+def test_a_wrong_plane_is_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        landscape(bandit(), **kwargs)
+
+
+plots = pytest.importorskip("matplotlib") and pytest.importorskip("sb3_reinforce.plots")
+
+
+def save(ax, path):
+    import matplotlib.pyplot as plt
+
+    ax.figure.savefig(path)
+    plt.close(ax.figure)
+    assert path.stat().st_size > 1000
+
+
+def test_every_picture_can_be_saved(tmp_path):
+    table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 20)
+    ax = plots.plot_baselines(table)
+    assert [label.get_text() for label in ax.get_yticklabels()] == table.names[:-1]
+    save(ax, tmp_path / "baselines.png")
+    ax = plots.plot_learning_curves({"a": np.random.rand(5, 8), "b": np.random.rand(4, 3, 8)}, np.arange(8))
+    assert [line.get_label() for line in ax.get_lines()] == ["a (5 runs)", "b (4 runs)"]
+    save(ax, tmp_path / "curves.png")
+    ax = plots.plot_landscape(landscape(bandit(), {"g": th.ones(4)}, n_points=3, n_episodes=2))
+    save(ax, tmp_path / "landscape.png")
+    ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])
+    save(ax, tmp_path / "variances.png")
+
+
+def test_a_picture_is_drawn_on_the_axes_it_is_given():
+    import matplotlib.pyplot as plt
+
+    figure, ax = plt.subplots()
+    assert plots.plot_learning_curves({"a": np.random.rand(5, 8)}, np.arange(8), ax) is ax
+    plt.close(figure)
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+    scores = np.array([[-1e9], [2.0], [4.0], [1e9]])
+    assert plots.interquartile_mean(scores) == 3
+    mean, low, high = plots.interquartile_interval(np.random.randn(40, 2, 3), 200, 0.95, 0)
+    assert ((low < mean) & (mean < high)).all()
+    assert (high - low < 1).all()
+
+
+def test_curves_of_a_single_run_are_refused():
+    for wrong in (np.ones((1, 8)), np.ones((3, 7)), np.ones(8)):
+        with pytest.raises(ValueError, match=r"runs\['a'\]"):
+            plots.plot_learning_curves({"a": wrong}, np.arange(8))
