@@ -9,11 +9,11 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
 from sb3_reinforce.collection import by_step
 from sb3_reinforce.critic import stack
-from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout, select, take
+from sb3_reinforce.rollouts import Rollout, take
 from sb3_reinforce.sampling import Infos
-from sb3_reinforce.scores import flat, gradients_by_episode, score_parameters
+from sb3_reinforce.scores import flat, gradients_by_episode, score_parameters, scored_parameters
 
 # Draws behind a frequency or a mean action
 N_DRAWS = 4096
@@ -223,9 +223,7 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     """
     weights = th.as_tensor(by_step(sampler.rollout_buffer, sampler.rollout_buffer.advantages)).double()
     expected = gradients_by_episode(rollout, weights * rollout.discounts)[0].sum(0) / sampler._denominator(rollout)
-    obs = take(select(rollout.observations, rollout.used), th.arange(1))
-    actions = as_policy_actions(select(rollout.actions, rollout.used)[:1], sampler.action_space)
-    parameters: Parameters = score_parameters(sampler.policy, obs, actions)
+    parameters = scored_parameters(rollout)
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
     sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=1.0)
     sampler.lr_schedule = FloatSchedule(1.0)

@@ -20,11 +20,10 @@ from sb3_reinforce.gradient_statistics import Estimate, cosine, interval, moment
 from sb3_reinforce.landscapes import CandidateUtility
 from sb3_reinforce.parameters import actor_parameters
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
-from sb3_reinforce.policies import Parameters, as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout, flatten, take
+from sb3_reinforce.rollouts import Rollout
 from sb3_reinforce.sampling import sampled
-from sb3_reinforce.scores import gradients_by_episode, score_parameters
+from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.search_settings import default_delta_std, default_n_delta
 from sb3_reinforce.tables import Table
 
@@ -169,11 +168,8 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     rollout = cast(Rollout, sampler._rollout)
     baseline = baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, rollout.returns - baseline)[0].double().cpu()
-    step = th.arange(1)
-    actions = as_policy_actions(take(flatten(rollout.actions), step), plain.action_space)
-    scored: Parameters = score_parameters(plain.policy, take(flatten(rollout.observations), step), actions)
     wanted = {id(parameter) for parameter in actor_parameters(plain.policy)}
-    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored])
+    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
     return gradients[:, mask], len(infos.infos) * cast(VecEnv, plain.env).num_envs
 
 

@@ -15,9 +15,9 @@ from sb3_reinforce.check_errors import (
 )
 from sb3_reinforce.policies import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import select, take
+from sb3_reinforce.rollouts import select
 from sb3_reinforce.sampling import check_model, sampled
-from sb3_reinforce.scores import score_parameters
+from sb3_reinforce.scores import scored_parameters
 from sb3_reinforce.tables import Table
 
 
@@ -99,7 +99,7 @@ def check_rows(model: REINFORCE, n_episodes: int) -> list[CheckRow]:
     assert rollout is not None
     obs = select(rollout.observations, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
-    score_parameters(policy, take(obs, th.arange(1)), actions[:1])
+    scored_parameters(rollout)
     return [
         row("log_prob", log_prob_error(policy, obs), 1e-4, "log π(a|s) when drawn and when evaluated"),
         row("scores", score_error(policy, obs, actions), 0.02, "∇ log π by autograd and by differences"),

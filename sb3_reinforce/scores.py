@@ -8,7 +8,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy, reached
-from sb3_reinforce.rollouts import Rollout, select, take
+from sb3_reinforce.rollouts import Rollout, flatten, select, take
 
 # The most steps that share a gradient while they are summed: fewer would write more gradients
 PIECE = 128
@@ -70,7 +70,7 @@ def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHU
     policy, used = rollout.policy, rollout.used
     obs = select(rollout.observations, used)
     actions = as_policy_actions(select(rollout.actions, used), policy.action_space)
-    parameters = score_parameters(policy, take(obs, th.arange(1)), actions[:1])
+    parameters = scored_parameters(rollout)
     episode, slots, filled = pieces_of(rollout.episodes[used])
     w = th.stack([select(weight, used) for weight in weights]).to(parameters[0])
     w = (w[:, slots] * filled.to(w)).transpose(0, 1)
@@ -145,6 +145,18 @@ def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
             f"{len(parameters)} trainable parameters (is it computed under no_grad, or detached?)"
         )
     return [parameter for parameter, used in zip(parameters, depends, strict=True) if used]
+
+
+def scored_parameters(rollout: Rollout) -> Parameters:
+    """
+    ``score_parameters`` of the policy that made a rollout, from its first step.
+
+    :param rollout: The rollout
+    :raises ValueError: If there are none
+    """
+    first = th.arange(1)
+    actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
+    return score_parameters(rollout.policy, take(flatten(rollout.observations), first), actions)
 
 
 def episode_gradients(rollout: Rollout, *weights: th.Tensor) -> Iterator[tuple[th.Tensor, ...]]:
