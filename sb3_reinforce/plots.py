@@ -144,6 +144,8 @@ def plot_variances(
         (line,) = ax.plot(x, mean, marker="o", markersize=3, label=name)
         ax.fill_between(x, mean - width * error, mean + width * error, color=line.get_color(), alpha=0.2)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
+    ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
+    ax.minorticks_off()
     ax.legend()
     return ax
 

@@ -130,6 +130,15 @@ def test_nothing_is_said_of_a_healthy_run():
 def test_nothing_is_said_of_long_healthy_runs():
     healthy("CartPole-v1", 60_000)
     healthy("Pendulum-v1", 100_000, normalize=True, gamma=0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
+    with warnings.catch_warnings():
+        # Box2D is not there, or warns where it is imported, and an error there would not be caught
+        warnings.simplefilter("ignore")
+        pytest.importorskip("Box2D")
     healthy("LunarLander-v3", 150_000)
 
 
