@@ -16,7 +16,7 @@ from sb3_reinforce.sampling import Infos
 from sb3_reinforce.scores import flat, gradients_by_episode, score_parameters, scored_parameters
 
 # Draws behind a frequency or a mean action
-N_DRAWS = 4096
+N_DRAWS = 1024
 
 
 def relative(x: th.Tensor, y: th.Tensor) -> float:

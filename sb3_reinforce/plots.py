@@ -146,7 +146,7 @@ def plot_variances(
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
     ax.minorticks_off()
-    ax.legend()
+    ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return ax
 
 

@@ -1,5 +1,8 @@
 """What is logged of the gradient's quality, and that training is the same with and without it."""
 
+import subprocess
+import sys
+
 import pytest
 import torch as th
 from environments import Corridor, Tree
@@ -100,3 +103,19 @@ def test_a_users_mistake_is_named():
         train(GradientQualityCallback(baselines=("median",)))
     with pytest.raises(ValueError, match="no critic"):
         train(GradientQualityCallback(baselines=("value",)), baseline="none")
+
+
+def test_nothing_here_needs_the_extras():
+    """Neither training nor the lab, but for its pictures, where matplotlib and pandas cannot be imported."""
+    script = """
+import sys
+sys.modules.update({"matplotlib": None, "pandas": None})
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback, check_gradient, compare_baselines
+model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", seed=0)
+model.learn(128, [GradientQualityCallback(1), PitfallCallback()])
+print(compare_baselines(model, 5), check_gradient(model).passed)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("True\n")
