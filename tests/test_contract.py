@@ -563,7 +563,7 @@ def test_a_squashed_action_is_unscaled_for_the_environment():
     kwargs = {"squash_output": True, "log_std_init": 1.0}
     model = REINFORCE("MlpPolicy", Recorder(gym.make("Pendulum-v1")), n_steps=8, use_sde=True, policy_kwargs=kwargs)
     model.learn(8)
-    np.testing.assert_allclose(np.ravel(sent), 2 * model.rollout_buffer.actions.ravel(), rtol=1e-6)
+    np.testing.assert_allclose(np.ravel(sent), 2 * model.rollout_buffer.actions.ravel(), atol=1e-6)
 
 
 def test_the_policy_can_be_pickled_and_copied():
