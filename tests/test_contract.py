@@ -94,7 +94,8 @@ def test_observation_spaces(name, mode):
         policy, env, baseline=mode.get("baseline", "value"), **{k: v for k, v in mode.items() if k != "baseline"}
     )
     model.learn(30)
-    model.predict(env.reset())
+    actions, _ = model.predict(env.reset())
+    assert model._n_updates > 0 and len(actions) == 2
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
@@ -247,7 +248,8 @@ def test_tensorboard(tmp_path):
 
 @pytest.mark.parametrize("log_interval", [1, 100, None])
 def test_log_intervals(log_interval):
-    REINFORCE("MlpPolicy", "CartPole-v1", n_steps=8).learn(32, log_interval=log_interval)
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=8).learn(32, log_interval=log_interval)
+    assert model.num_timesteps == 32
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
