@@ -34,8 +34,8 @@ Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
 # What a subclass may have changed on the way from an observation to an action
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
-# Steps for which noise is drawn at once
-NOISE_STEPS = 128
+# Actions for which noise is drawn at once
+NOISE_ROWS = 1024
 # Products beyond which NumPy's BLAS starts threads of its own, whatever number the user has set for PyTorch
 ONE_THREAD = 2**18
 
@@ -180,7 +180,7 @@ def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:
     :param n_envs: Number of environments
     :return: Arrays of shape ``(n_envs, width)``, without end; ``width`` is the number of logits or means
     """
-    size = (NOISE_STEPS, n_envs, cast(th.nn.Linear, policy.action_net).out_features)
+    size = (max(1, NOISE_ROWS // n_envs), n_envs, cast(th.nn.Linear, policy.action_net).out_features)
     while True:
         if isinstance(policy.action_dist, DiagGaussianDistribution):
             yield from th.randn(size).numpy()

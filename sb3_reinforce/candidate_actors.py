@@ -83,7 +83,7 @@ class MatrixActor:
         """
         policy = self.policy
         # No gradient is recorded: the stacks are no leaves of a graph
-        outputs = self.outputs(obs_as_tensor(obs, self.device))
+        outputs = self.outputs(obs)
         if self.deterministic:
             actions = mode(outputs, policy.action_space)
         elif isinstance(policy.action_dist, DiagGaussianDistribution):
@@ -95,15 +95,16 @@ class MatrixActor:
 
     def _features(self, obs: Any) -> th.Tensor:
         if self._is_vector:
-            # What the line below does to vectors, for a tenth of its price
-            return obs.float()  # type: ignore[no-any-return]
+            # What the lines below do to vectors, for a tenth of their price
+            return th.from_numpy(obs).to(self.device, th.float32)
+        obs = obs_as_tensor(obs, self.device)
         return BasePolicy.extract_features(self.policy, obs, self.policy.pi_features_extractor)
 
     def outputs(self, obs: Any) -> th.Tensor:
         """
         What the action net returns: means or logits.
 
-        :param obs: Observations of the environments, as tensors
+        :param obs: Observations of the environments
         :return: Shape ``(n_envs, n_outputs)``
         """
         x = self._features(obs)[:, None]
@@ -132,6 +133,7 @@ class VmapActor(MatrixActor):
 
     def outputs(self, obs: Any) -> th.Tensor:
         policy = self.policy
+        obs = obs_as_tensor(obs, self.device)
         preprocessed = preprocess_obs(obs, policy.observation_space, normalize_images=policy.normalize_images)
         return self._forward(self._named_stacks, preprocessed)
 

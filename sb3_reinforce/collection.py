@@ -97,12 +97,14 @@ def collect(
         if np.count_nonzero(dones):
             wanted = np.flatnonzero(all_dones[-1] & (owed > 0))
             model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
-            for i in wanted:
+            for i in wanted.tolist():
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    terminal_obs[n_steps, int(i)] = infos[i]["terminal_observation"]
+                    terminal_obs[n_steps, i] = infos[i]["terminal_observation"]
             owed[wanted] -= 1
             begun[wanted] = n_steps + 1
-            deadline, waiting = extent.max_episode_steps + min(begun[owed > 0], default=0), bool(owed.any())
+            if extent.n_steps == np.inf:
+                waiting = bool(owed.any())
+                deadline = extent.max_episode_steps + begun[owed > 0].min(initial=n_steps + 1)
         rollout_buffer.pos = n_steps = n_steps + 1
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True

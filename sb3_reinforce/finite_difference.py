@@ -319,7 +319,7 @@ class FiniteDifference(BaseAlgorithm):
     def _on_step(self, callback: BaseCallback, step: Step) -> None:
         """Count a step of the environments and tell the callback; raise ``Stopped`` if it returns False."""
         self.num_timesteps += len(step.dones)
-        if step.finished.any():
+        if np.count_nonzero(step.finished):
             finished = np.flatnonzero(step.finished)
             self._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
         callback.update_locals({"self": self, **vars(step)})

@@ -129,7 +129,7 @@ class REINFORCE(OnPolicyAlgorithm):
         discount_scores: bool = False,
         normalize_by: str = "steps",
         n_critic_updates: int = 4,
-        batch_size: int = 128,
+        batch_size: int = 256,
         critic_learning_rate: float | Schedule | None = None,
         temperature: float | Schedule = 1.0,
         min_std: float = 0.0,
@@ -341,8 +341,9 @@ class REINFORCE(OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:
-            # Passes that moved the statistics of a shared extractor would be a second step of the policy
-            self.policy.set_training_mode(not shared)
+            if shared:
+                # Passes that moved the statistics of a shared extractor would be a second step of the policy
+                self.policy.set_training_mode(False)
             update_learning_rate(self.critic_optimizer, critic_rate)
             passes = (self.n_critic_updates, self.batch_size, self.max_grad_norm)
             value_loss = fit_critic(

@@ -159,16 +159,15 @@ class GymnasiumVecEnv(VecEnv):
 
         :param method_name: Its name
         :param method_args: Its arguments
-        :param indices: Of which copies the results are returned
+        :param indices: Of which copies
         :param kwargs: Its keyword arguments
-        :raises AttributeError: If the vector environment has no copies that could be called
+        :raises NotImplementedError: If the vector environment has no copies in this process that could be called
         """
-        if not hasattr(self.env.unwrapped, "call"):
-            raise AttributeError(
-                f"{self.env} steps all its copies at once and cannot call {method_name!r} on one of them"
-            )
-        results = self.env.unwrapped.call(method_name, *method_args, **kwargs)
-        return [results[i] for i in self._get_indices(indices)]
+        copies = getattr(self.env.unwrapped, "envs", None)
+        if copies is None:
+            raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
+        calls = [copies[i].get_wrapper_attr(method_name) for i in self._get_indices(indices)]
+        return [call(*method_args, **kwargs) for call in calls]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None

@@ -10,7 +10,7 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.vec_env import GymnasiumVecEnv
 
 N_ENVS = 3
@@ -141,13 +141,22 @@ def test_attributes_and_methods_where_the_environment_can():
     assert env.get_attr("lengths") == [(3,)] * N_ENVS and env.get_attr("lengths", 1) == [(3,)]
     env.set_attr("truncate", True)
     assert env.get_attr("truncate") == [True] * N_ENVS
-    assert len(env.env_method("observe")) == N_ENVS
+    assert len(env.env_method("observe")) == N_ENVS and len(env.env_method("observe", indices=[2])) == 1
     assert env.env_is_wrapped(gym.Wrapper) == [False] * N_ENVS and env.has_attr("lengths")
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("truncate", True, indices=[0])
     assert native().get_attr("max_episode_steps") == [500] * N_ENVS
-    with pytest.raises(AttributeError, match="at once"):
+    with pytest.raises(NotImplementedError, match="single copies"):
         native().env_method("render")
+
+
+def test_finite_difference_trains_on_it():
+    """With seeded starts where there are single copies to seed, and a sentence that says what to set where not."""
+    seeded = FiniteDifference("LinearPolicy", synced(Corridor, "SameStep"), n_delta=12, seed=0).learn(50)
+    unseeded = FiniteDifference("LinearPolicy", native(), n_delta=12, common_random_numbers=False, seed=0).learn(50)
+    assert seeded._n_updates > 0 and unseeded._n_updates > 0
+    with pytest.raises(ValueError, match="common_random_numbers=False"):
+        FiniteDifference("LinearPolicy", native(), n_delta=12).learn(50)
 
 
 def test_pictures():
