@@ -73,10 +73,19 @@ def optimal(rollout: Rollout) -> th.Tensor:
     G_0 weighted by ‖S_j‖² (Peters and Schaal, 2008, section 3.2, summed over components). Unbiased, because the sums
     leave out the episode that b is applied to.
     """
-    products, squares = score_products(rollout)
+    return ratio_of_others(*score_products(rollout))[rollout.episodes]
+
+
+def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
+    """
+    ``b_i = Σ_{j≠i} products_j / Σ_{j≠i} squares_j``, and 0 where the latter is 0.
+
+    :param products: ⟨A_j, S_j⟩, shape ``(n_episodes,)``
+    :param squares: ‖S_j‖², shape ``(n_episodes,)``
+    :return: Shape ``(n_episodes,)``
+    """
     above, below = sum_of_others(products), sum_of_others(squares)
-    constants = th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)
-    return constants[rollout.episodes]
+    return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)
 
 
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
