@@ -19,7 +19,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_reinforce.candidate_actors import MatrixActor
-from sb3_reinforce.workers import step
+from sb3_reinforce.stepping import stepper
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -158,7 +158,7 @@ def evaluate(
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
-    returns = np.zeros((len(thetas), n_episodes))
+    returns, step = np.zeros((len(thetas), n_episodes)), stepper(env)
     for queue in queues(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         slots = Slots(queue, env.num_envs, max_episode_steps)
         obs = start(env, slots.pairs, seeds)
@@ -167,7 +167,7 @@ def evaluate(
             if begun:
                 actor.assign(begun, thetas[[slots.pairs[i][0] for i in begun]])
                 begun = []
-            new_obs, rewards, dones, infos = step(env, actor.act(obs))
+            new_obs, rewards, dones, infos = step(actor.act(obs))
             obs = new_obs
             slots.add(rewards if original is None else original(), new_obs)
             finished = dones & slots.active

@@ -21,7 +21,7 @@ from sb3_reinforce.actors import make_actor
 from sb3_reinforce.arguments import check_finite
 from sb3_reinforce.returns import Bools
 from sb3_reinforce.rollouts import Extent
-from sb3_reinforce.workers import stepper
+from sb3_reinforce.stepping import stepper
 
 # The arrays of a RolloutBuffer that have one row per step
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
