@@ -1,12 +1,14 @@
 """Checks of what a user passes in: each error names the argument, its value and what is allowed."""
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -97,6 +99,10 @@ def check_function(name: str, value: Any, functions: dict[str, Callable[..., Any
     return functions[value]
 
 
+# A larger step can take a parameter out of the range of float32
+MAX_LEARNING_RATE = 1e6
+
+
 class CheckedSchedule(FloatSchedule):
     """
     A schedule whose every value is checked, so that a wrong one is named and not trained with.
@@ -105,67 +111,98 @@ class CheckedSchedule(FloatSchedule):
     :param schedule: A number, or a function of the progress that remains (from 1 to 0)
     :param low: Smallest allowed value
     :param above: Exclude ``low`` itself
+    :param high: Largest allowed value
     :raises TypeError: If ``schedule`` is neither a number nor callable
     :raises ValueError: If its value at the start or at the end of training is not finite or not in the range
     """
 
-    def __init__(self, name: str, schedule: float | Schedule, low: float = 0.0, above: bool = False):
-        super().__init__(schedule if callable(schedule) else check_number(name, schedule, low, above=above))
-        self.name, self.low, self.above = name, low, above
+    def __init__(
+        self, name: str, schedule: float | Schedule, low: float = 0.0, above: bool = False, high: float = math.inf
+    ):
+        super().__init__(schedule if callable(schedule) else check_number(name, schedule, low, high, above))
+        self.name, self.low, self.above, self.high = name, low, above, high
         for progress_remaining in (1.0, 0.0):
             self(progress_remaining)
 
     def __call__(self, progress_remaining: float) -> float:
         value = self.value_schedule(progress_remaining)
-        value = value.item() if hasattr(value, "item") else value
-        return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, above=self.above)
+        value = value.item() if getattr(value, "size", 1) == 1 and hasattr(value, "item") else value
+        return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, self.above)
 
 
-def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+def check_basics(
+    policy: Any, policy_kwargs: Any, stats_window_size: Any, tensorboard_log: Any, verbose: Any, seed: Any, device: Any
+) -> None:
     """
-    Check that a policy of Stable-Baselines3 can act in these spaces.
+    Check arguments that Stable-Baselines3 uses as soon as it has them. Called at construction and again by ``load``.
 
-    :param observation_space: The environment's observation space
-    :param action_space: The environment's action space
-    :raises ValueError: If it cannot
+    :param policy: The argument of this name, as are all others
+    :param policy_kwargs: None or a dict
+    :param stats_window_size: 1 or more
+    :param tensorboard_log: None or a path
+    :param verbose: 0 or more
+    :param seed: None, or 0 or more
+    :param device: A device, or "auto"
+    :raises TypeError: If one is of the wrong kind
+    :raises ValueError: If one is out of its range
     """
-    if not isinstance(action_space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-        raise ValueError(f"The action space must be Box, Discrete, MultiDiscrete or MultiBinary, got {action_space}")
-    if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
-        raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
-    if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
-        raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
-    parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-    for key, space in parts.items():
-        where = f" under {key!r}" if key else ""
-        if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+    if not isinstance(policy, (str, type)):
+        raise TypeError(f"policy must be a name or a class, got {policy!r} of type {type(policy).__name__}")
+    check_kind("policy_kwargs", policy_kwargs, (Mapping,))
+    check_kind("tensorboard_log", tensorboard_log, (str, os.PathLike))
+    check_integer("stats_window_size", stats_window_size, 1)
+    check_integer("verbose", verbose, 0)
+    if seed is not None:
+        check_integer("seed", seed, 0)
+    check_kind("device", device, (str, th.device), optional=False)
+    if device != "auto":
+        try:
+            th.device(device)
+        except RuntimeError as error:
             raise ValueError(
-                f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
-                f"got {space}"
-            )
-        if np.any(getattr(space, "start", 0)):
-            raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
+                f"device must be 'auto' or a device that PyTorch knows, got {device!r}: {error}"
+            ) from error
 
 
-def check_finite(name: str, values: Any, where: tuple[int, ...] = ()) -> None:
+def check_kind(name: str, value: Any, kinds: tuple[type, ...], optional: bool = True) -> None:
     """
-    Check numbers that came from an environment.
+    Check the type of an argument.
 
-    :param name: What they are, for the message
-    :param values: An array of shape ``(n_steps, n_envs, ...)`` less the dimensions in ``where``, or a dict of them
-    :param where: The step, or the step and the environment, that ``values`` belong to
-    :raises ValueError: Naming the first step and environment where a number is not finite
+    :param name: Name of the argument, for the message
+    :param value: What the user passed
+    :param kinds: The types allowed
+    :param optional: Whether None is allowed too
+    :raises TypeError: If it is of another type
     """
-    if isinstance(values, dict):
-        for key, part in values.items():
-            check_finite(f"{name} {key!r}", part, where)
-        return
-    values = np.asarray(values)
-    if values.dtype.kind != "f" or np.isfinite(values).all():
-        return
-    first = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
-    step, env = (*where, *first)[:2]
-    raise ValueError(
-        f"{name} of environment {env} at step {step} of the rollout is not finite: {values[first]}. "
-        "The policy has not been updated with this rollout."
-    )
+    if not (isinstance(value, kinds) or (optional and value is None)):
+        allowed = [*(kind.__name__ for kind in kinds), *["None"] * optional]
+        raise TypeError(f"{name} must be {' or '.join(allowed)}, got {value!r} of type {type(value).__name__}")
+
+
+def check_learn(
+    env: Any, total_timesteps: Any, callback: Any, log_interval: Any, tb_log_name: Any, *flags: tuple[str, Any]
+) -> None:
+    """
+    Check the arguments of ``learn``.
+
+    :param env: The model's environments
+    :param total_timesteps: The argument of this name, as are all others
+    :param callback: None, a callback, a function or a list of callbacks
+    :param log_interval: 1 or more, or None
+    :param tb_log_name: A name
+    :param flags: Name and value of the others
+    :raises TypeError: If one is of the wrong kind
+    :raises ValueError: If one is out of its range, or the model has no environment
+    """
+    if env is None:
+        raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
+    check_number("total_timesteps", total_timesteps, 0)
+    if log_interval is not None:
+        check_integer("log_interval", log_interval, 1)
+    check_kind("tb_log_name", tb_log_name, (str,), optional=False)
+    for name, value in flags:
+        check_flag(name, value)
+    for each in callback if isinstance(callback, list) else [callback]:
+        is_one = isinstance(each, BaseCallback) or (callable(each) and not isinstance(each, type) and each is callback)
+        if not (is_one or callback is None):
+            raise TypeError(f"callback must be a callback, a list of callbacks, a function or None, got {each!r}")

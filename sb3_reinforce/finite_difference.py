@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -16,17 +16,19 @@ from stable_baselines3.common.policies import (
     BasePolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import optimization, parameters
-from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce import optimization, parameters, persistence
+from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_basics, check_function, check_learn
 from sb3_reinforce.candidate_actors import LoopActor, make_actor
 from sb3_reinforce.candidates import Step, evaluate
 from sb3_reinforce.collection import shift_to_start
+from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
+from sb3_reinforce.guards import guarded
+from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.linear_policy import LinearPolicy
 from sb3_reinforce.normalization import frozen
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
@@ -38,6 +40,7 @@ from sb3_reinforce.search_settings import (
     default_delta_std,
     default_n_delta,
 )
+from sb3_reinforce.storage import Place
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -101,6 +104,7 @@ class FiniteDifference(BaseAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     policy: ActorCriticPolicy
+    save, set_env, set_parameters = persistence.save, persistence.set_env, persistence.set_parameters
 
     def __init__(
         self,
@@ -126,9 +130,9 @@ class FiniteDifference(BaseAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if env is not None:
-            env = maybe_make_env(env, verbose)
-            check_spaces(env.observation_space, env.action_space)
+        check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
+        if env is not None or _init_setup_model:
+            env = check_env(env, verbose)
         super().__init__(
             policy,
             env,
@@ -158,7 +162,7 @@ class FiniteDifference(BaseAlgorithm):
             self._setup_model()
 
     def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate)
+        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate, high=MAX_LEARNING_RATE)
         if self.delta_std is not None:
             self.delta_std_schedule = CheckedSchedule("delta_std", self.delta_std, above=True)
 
@@ -190,6 +194,7 @@ class FiniteDifference(BaseAlgorithm):
         # An update that begins after a callback or a user has moved the count must not train at a negative rate
         super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
+    @guarded
     def learn(
         self: SelfFiniteDifference,
         total_timesteps: int,
@@ -212,9 +217,8 @@ class FiniteDifference(BaseAlgorithm):
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         """
-        check_number("total_timesteps", total_timesteps, 0)
-        if log_interval is not None:
-            check_integer("log_interval", log_interval, 1)
+        flags = ("reset_num_timesteps", reset_num_timesteps), ("progress_bar", progress_bar)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, *flags)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -334,6 +338,7 @@ class FiniteDifference(BaseAlgorithm):
         if not go_on:
             raise Stopped
 
+    @uninterrupted
     def train(self, gradient: th.Tensor) -> None:
         """
         One optimizer step uphill.
@@ -402,23 +407,24 @@ class FiniteDifference(BaseAlgorithm):
         actions, state = super().predict(observation, state, episode_start, deterministic)
         return shift_to_start(self.action_space, actions), state
 
-    def set_parameters(
-        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
+    @classmethod
+    def load(
+        cls: type[SelfFiniteDifference],
+        path: Place,
+        env: GymEnv | None = None,
+        *args: Any,
+        restore_random_state: bool = False,
+        **kwargs: Any,
+    ) -> SelfFiniteDifference:
         """
-        Take parameters from a file or dictionary, which may be those of another algorithm with the same policy class.
+        Load a model, see ``persistence.load``. This runs code from the file: load only what you trust.
 
-        :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` of a model returns
-        :param exact_match: Whether the parameters must be those of a FiniteDifference; if not, those of objects that it
-            does not have, such as an optimizer for the critic, are left out
-        :param device: Device on which the parameters are loaded
+        :param path: The file
+        :param env: The environment to go on in; None for prediction alone
+        :param restore_random_state: Put the global random generators into the state that they had at ``save``
+        :return: The model
         """
-        if not exact_match:
-            if not isinstance(load_path_or_dict, dict):
-                _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
-            mine = self._get_torch_save_params()[0]
-            load_path_or_dict = {name: load_path_or_dict[name] for name in mine if name in load_path_or_dict}
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        return persistence.load(cls, path, env, *args, restore_random_state=restore_random_state, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         mine = ["_actor_parameters", "_actor", "_candidates", "_utilities", "_observed"]

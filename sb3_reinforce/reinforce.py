@@ -1,10 +1,10 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
+import math
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -19,11 +19,14 @@ from stable_baselines3.common.utils import explained_variance, update_learning_r
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
-from sb3_reinforce import optimization
-from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce import optimization, persistence
+from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_basics, check_function, check_learn
 from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.collection import check_data, collect, shift_to_start, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
+from sb3_reinforce.environment_checks import check_env
+from sb3_reinforce.guards import guarded
+from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.policies import (
     Parameters,
     floor_std,
@@ -33,6 +36,7 @@ from sb3_reinforce.policies import (
 )
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
 from sb3_reinforce.settings import check_reinforce
+from sb3_reinforce.storage import Place
 from sb3_reinforce.weighing import Running, Steps, Weighing, used_steps, weigh
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
@@ -111,6 +115,7 @@ class REINFORCE(OnPolicyAlgorithm):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
+    save, set_env, set_parameters = persistence.save, persistence.set_env, persistence.set_parameters
 
     def __init__(
         self,
@@ -147,9 +152,9 @@ class REINFORCE(OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if env is not None:
-            env = maybe_make_env(env, verbose)
-            check_spaces(env.observation_space, env.action_space)
+        check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
+        if env is not None or _init_setup_model:
+            env = check_env(env, verbose)
         super().__init__(
             policy,
             env,
@@ -199,15 +204,15 @@ class REINFORCE(OnPolicyAlgorithm):
         return Weighing(baseline, self.gamma, self.gae_lambda, self.reward_to_go, self.discount_scores)
 
     def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate)
+        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate, high=MAX_LEARNING_RATE)
 
-    def _scheduled(self, name: str, above: bool = False) -> float:
+    def _scheduled(self, name: str, above: bool = False, high: float = math.inf) -> float:
         """The present value of an argument that may be a schedule, and that a callback may have set anew."""
-        return CheckedSchedule(name, getattr(self, name), above=above)(self._current_progress_remaining)
+        return CheckedSchedule(name, getattr(self, name), above=above, high=high)(self._current_progress_remaining)
 
     def _critic_rate(self) -> float:
         name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
-        return self._scheduled(name)
+        return self._scheduled(name, high=MAX_LEARNING_RATE)
 
     def _setup_model(self) -> None:
         check_reinforce(self)
@@ -309,6 +314,7 @@ class REINFORCE(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    @uninterrupted
     def train(self) -> None:
         """
         One policy step along ĝ, then the critic's passes.
@@ -378,6 +384,7 @@ class REINFORCE(OnPolicyAlgorithm):
         actions, state = super().predict(observation, state, episode_start, deterministic)
         return shift_to_start(self.action_space, actions), state
 
+    @guarded
     def learn(
         self: SelfREINFORCE,
         total_timesteps: int,
@@ -399,9 +406,8 @@ class REINFORCE(OnPolicyAlgorithm):
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
         """
-        check_number("total_timesteps", total_timesteps, 0)
-        if log_interval is not None:
-            check_integer("log_interval", log_interval, 1)
+        flags = ("reset_num_timesteps", reset_num_timesteps), ("progress_bar", progress_bar)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, *flags)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -409,6 +415,25 @@ class REINFORCE(OnPolicyAlgorithm):
         # The first rollout is drawn at the temperature of the run's start, not at that of the end of the run before
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         return total_timesteps, callback
+
+    @classmethod
+    def load(
+        cls: type[SelfREINFORCE],
+        path: Place,
+        env: GymEnv | None = None,
+        *args: Any,
+        restore_random_state: bool = False,
+        **kwargs: Any,
+    ) -> SelfREINFORCE:
+        """
+        Load a model, see ``persistence.load``. This runs code from the file: load only what you trust.
+
+        :param path: The file
+        :param env: The environment to go on in; None for prediction alone
+        :param restore_random_state: Put the global random generators into the state that they had at ``save``
+        :return: The model
+        """
+        return persistence.load(cls, path, env, *args, restore_random_state=restore_random_state, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_sorted_parameters", "_rollout"]

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.arguments import check_function, check_integer, check_number
+from sb3_reinforce.arguments import check_basics, check_flag, check_function, check_integer, check_number
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.perturbations import PERTURBATIONS
 
@@ -23,6 +23,10 @@ def check_finite_difference(model: Any) -> None:
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range, or does not go with another
     """
+    window, log = model._stats_window_size, model.tensorboard_log
+    check_basics(model.policy_class, model.policy_kwargs, window, log, model.verbose, model.seed, model.device)
+    for name in ("common_random_numbers", "standardize_utilities", "deterministic"):
+        check_flag(name, getattr(model, name))
     check_function("estimator", model.estimator, ESTIMATORS)
     check_function("perturbation", model.perturbation, PERTURBATIONS)
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, ActorCriticPolicy)):

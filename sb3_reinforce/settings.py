@@ -1,10 +1,20 @@
 """What the arguments of REINFORCE must satisfy, alone and together, and what those left open become."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_reinforce.arguments import check_choice, check_flag, check_function, check_integer, check_number
+from sb3_reinforce.arguments import (
+    check_basics,
+    check_choice,
+    check_flag,
+    check_function,
+    check_integer,
+    check_kind,
+    check_number,
+)
 from sb3_reinforce.baselines import BASELINES
 
 DEFAULT_N_STEPS = 32
@@ -21,6 +31,8 @@ def check_reinforce(model: Any) -> None:
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range, or does not go with another
     """
+    window, log = model._stats_window_size, model.tensorboard_log
+    check_basics(model.policy_class, model.policy_kwargs, window, log, model.verbose, model.seed, model.device)
     check_function("baseline", model.baseline, BASELINES)
     if model.n_steps is None and model.n_episodes is None:
         model.n_steps = DEFAULT_N_STEPS if model.has_critic else None
@@ -36,11 +48,12 @@ def check_reinforce(model: Any) -> None:
         check_integer("n_steps", model.n_steps, 1)
     for name, low in {"n_critic_updates": 1, "batch_size": 1, "max_episode_steps": 1, "sde_sample_freq": -1}.items():
         check_integer(name, getattr(model, name), low)
-    check_integer("stats_window_size", model._stats_window_size, 1)
-    if model.seed is not None:
-        check_integer("seed", model.seed, 0)
     for name in ("reward_to_go", "discount_scores", "normalize_advantage", "use_sde"):
         check_flag(name, getattr(model, name))
+    check_kind("rollout_buffer_kwargs", model.rollout_buffer_kwargs, (Mapping,))
+    buffer_class = model.rollout_buffer_class
+    if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, RolloutBuffer)):
+        raise TypeError(f"rollout_buffer_class must be a subclass of RolloutBuffer, got {buffer_class!r}")
     check_number("gamma", model.gamma, 0, 1)
     check_number("gae_lambda", model.gae_lambda, 0, 1)
     check_number("vf_coef", model.vf_coef, 0)

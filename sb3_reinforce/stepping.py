@@ -1,20 +1,20 @@
 """
-How environments are stepped: as their own ``step`` does it, with two differences.
+How environments are stepped: as their own ``step`` does it, but a ``DummyVecEnv`` without its deep copies.
 
-A ``DummyVecEnv`` is stepped without its deep copies, which with 64 CartPoles are a fourth of its time, and a
-``SubprocVecEnv`` without waiting for ever for a worker that has died.
+With 64 CartPoles these are a fourth of its time.
 """
 
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
-from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
+
+from sb3_reinforce.environment_checks import check_observation
 
 
 def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
@@ -24,8 +24,6 @@ def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
     :param env: The environments
     :return: A function of actions of shape ``(n_envs, ...)``
     """
-    if isinstance(env.unwrapped, SubprocVecEnv):
-        return partial(step_workers, env)
     if type(env) is DummyVecEnv and not vars(env).keys() & {"step", "step_async", "step_wait"}:
         return partial(step_in_turn, env)
     return env.step
@@ -39,10 +37,11 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
 
     :param env: The environments
     :param actions: Shape ``(n_envs, ...)``
+    :raises ValueError: If an observation or a reward is malformed
     """
     rewards, dones, infos = np.empty(env.num_envs, dtype=np.float32), np.empty(env.num_envs, dtype=bool), []
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
-        obs, rewards[i], terminated, truncated, info = single.step(action)
+        obs, reward, terminated, truncated, info = single.step(action)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
         dones[i] = terminated or truncated
         if terminated or truncated:
@@ -50,32 +49,25 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
         env._save_obs(i, obs)
+        try:
+            rewards[i] = reward
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"The reward of environment {i} must be a number, got {reward!r}") from error
         infos.append(info)
     rows = {key: part.copy() for key, part in env.buf_obs.items()}
     return dict_to_obs(env.observation_space, rows), rewards, dones, infos
 
 
-def step_workers(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
+def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
     """
-    ``env.step(actions)``; if a worker dies, an error that names it.
+    What ``env._save_obs(i, obs)`` does, refusing what it would broadcast or cast to another kind without a word.
 
-    Without this, with ``start_method="fork"``, the step would never return: the other workers hold the dead one's end
-    of its pipe open.
-
-    :param env: Environments over a ``SubprocVecEnv``
-    :param actions: Shape ``(n_envs, ...)``
-    :raises ConnectionError: If a worker is dead
+    :param env: The environments
+    :param i: Which one
+    :param obs: Its observation
+    :raises ValueError: If the observation is malformed
     """
-    workers: Any = env.unwrapped
-    try:
-        env.step_async(actions)
-        for remote, process in zip(workers.remotes, workers.processes, strict=True):
-            if remote not in wait([remote, process.sentinel]):
-                raise EOFError
-        return env.step_wait()
-    except (EOFError, ConnectionError) as error:
-        sentinels = [process.sentinel for process in workers.processes]
-        # A pipe may close a moment before its process is gone
-        gone = wait(sentinels, timeout=5)
-        dead = [i for i, sentinel in enumerate(sentinels) if sentinel in gone]
-        raise ConnectionError(f"The worker of environment {', '.join(map(str, dead))} died") from error
+    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
+    if rows is None or getattr(obs, "shape", None) != rows.shape[1:] or obs.dtype is not rows.dtype:
+        check_observation(env.observation_space, obs, i)
+    DummyVecEnv._save_obs(env, i, obs)

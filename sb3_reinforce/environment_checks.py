@@ -1,0 +1,129 @@
+"""Checks of environments and of what they return: each error names the environment, and the step where there is one."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.type_aliases import GymEnv
+
+
+def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
+    """
+    Check what a user gives a model to learn from.
+
+    :param env: What the user passed; an id that is registered in Gymnasium is made
+    :param verbose: The argument of this name
+    :param n_envs: The number of environments that there must be; None for any
+    :return: The environment
+    :raises TypeError: If it is no environment
+    :raises ValueError: If no policy can act in its spaces, or the number is another
+    """
+    vectorized = isinstance(env, gym.vector.VectorEnv)
+    if vectorized or not (isinstance(env, str) or hasattr(env, "observation_space")):
+        hint = ": wrap it in GymnasiumVecEnv" if vectorized else ""
+        raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")
+    made: GymEnv = maybe_make_env(env, verbose)
+    check_spaces(made.observation_space, made.action_space)
+    found = getattr(made, "num_envs", 1)
+    if n_envs not in (None, found):
+        raise ValueError(
+            f"env must have num_envs={n_envs}, as the model has, got {found}: for another number save the model and "
+            "load it with that env"
+        )
+    return made
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """
+    Check that a policy of Stable-Baselines3 can act in these spaces.
+
+    :param observation_space: The environment's observation space
+    :param action_space: The environment's action space
+    :raises ValueError: If it cannot
+    """
+    if not isinstance(action_space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+        raise ValueError(f"The action space must be Box, Discrete, MultiDiscrete or MultiBinary, got {action_space}")
+    if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
+        raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
+    if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
+        raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
+    if is_empty(action_space):
+        raise ValueError(f"The action space must not be empty, got {action_space}")
+    if isinstance(observation_space, spaces.Dict) and not observation_space.spaces:
+        raise ValueError(f"The observation space must not be empty, got {observation_space}")
+    parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+    for key, space in parts.items():
+        where = f" under {key!r}" if key else ""
+        if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+            raise ValueError(
+                f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
+                f"got {space}"
+            )
+        if is_empty(space):
+            raise ValueError(f"The observation space{where} must not be empty, got {space}")
+        if np.any(getattr(space, "start", 0)):
+            raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
+
+
+def is_empty(space: spaces.Space[Any]) -> bool:
+    """
+    Whether an element of a space has no numbers in it.
+
+    :param space: A Box or a discrete space
+    """
+    return 0 in (space.shape or ())
+
+
+def check_finite(name: str, values: Any, where: tuple[int, ...] = (), since: str = "of the rollout") -> None:
+    """
+    Check numbers that came from an environment.
+
+    :param name: What they are, for the message
+    :param values: An array of shape ``(n_steps, n_envs, ...)`` less the dimensions in ``where``, or a dict of them
+    :param where: The step, or the step and the environment, that ``values`` belong to
+    :param since: What the steps are counted from, for the message
+    :raises ValueError: Naming the first step and environment where a number is not finite
+    """
+    if isinstance(values, dict):
+        for key, part in values.items():
+            check_finite(f"{name} {key!r}", part, where, since)
+        return
+    values = np.asarray(values)
+    if values.dtype.kind != "f" or np.isfinite(values).all():
+        return
+    first = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
+    step, env = (*where, *first)[:2]
+    raise ValueError(
+        f"{name} of environment {env} at step {step} {since} is not finite: {values[first]}. "
+        "The policy has not been updated with this rollout."
+    )
+
+
+def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
+    """
+    Check the form of an observation, which a VecEnv would stretch, cut or round to that of the space without a word.
+
+    :param space: The observation space
+    :param obs: What an environment returned
+    :param env: Which environment
+    :raises ValueError: If it is of another shape or kind
+    """
+    if isinstance(space, spaces.Dict):
+        if not isinstance(obs, dict) or obs.keys() != space.spaces.keys():
+            got = list(obs) if isinstance(obs, dict) else repr(obs)
+            raise ValueError(
+                f"The observation of environment {env} must be a dict with keys {list(space.spaces)}, got {got}"
+            )
+        for key, part in space.spaces.items():
+            check_observation(part, obs[key], env)
+        return
+    values = np.asarray(obs)
+    # Integers may stand for real numbers, but numbers with a fraction not for integers
+    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
+    if values.shape != space.shape or values.dtype.kind not in kinds:
+        raise ValueError(
+            f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
+            f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"
+        )

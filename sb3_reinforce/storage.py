@@ -1,0 +1,127 @@
+"""Files that are written whole or not at all, and checked before they are read."""
+
+import io
+import os
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeAlias
+from uuid import uuid4
+
+from stable_baselines3.common.save_util import open_path
+
+Place: TypeAlias = str | Path | io.BufferedIOBase
+
+
+@contextmanager
+def whole_or_not_at_all(place: Place) -> Iterator[io.BytesIO]:
+    """
+    A buffer to write to, which replaces a file at the end of the block, in one step.
+
+    If anything fails, within the block or with the disk, the file is as it was and nothing else is left. That holds for
+    a killed process too, but where the file system has no files without a name (O_TMPFILE, which Linux has): there a
+    ``.NAME.*.tmp`` is left if the process is killed in the moment of writing.
+
+    :param place: A path, to which ``.zip`` is added where it has no suffix, or a file opened for writing
+    """
+    buffer = io.BytesIO()
+    yield buffer
+    if isinstance(place, (str, Path)):
+        replace(path_of(Path(place)), buffer.getvalue())
+    else:
+        open_path(place, "w").write(buffer.getvalue())
+
+
+def path_of(path: Path) -> Path:
+    """
+    Where a model is saved, as in Stable-Baselines3; folders that do not exist are made.
+
+    :param path: What the user named
+    :return: The file; where a link was named, what it points to
+    """
+    path = path if path.suffix else path.with_name(f"{path.name}.zip")
+    if path.is_dir():
+        warnings.warn(f"{path} is a folder: the model is saved to {path}_2", stacklevel=5)
+        path = path.with_name(f"{path.name}_2")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.resolve()
+
+
+def replace(path: Path, content: bytes) -> None:
+    """
+    Replace a file, so that at each moment either the old one or the new one is there, whole.
+
+    :param path: The file; it need not exist
+    :param content: The new content
+    :raises OSError: If it cannot be written; the old file is then still there
+    """
+    beside = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
+    try:
+        with open(create(beside), "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            if not beside.exists():
+                give_name(file.fileno(), beside)
+        os.replace(beside, path)
+    finally:
+        with suppress(FileNotFoundError):
+            beside.unlink()
+
+
+def create(path: Path) -> int:
+    """
+    Open a new file for writing: one without a name where the system has such, which vanishes with its process.
+
+    :param path: Its name, if it must have one
+    :return: The file descriptor
+    """
+    with suppress(AttributeError, OSError):
+        return os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666)
+    return os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+
+
+def give_name(descriptor: int, path: Path) -> None:
+    """
+    Name a file that has none.
+
+    :param descriptor: The file descriptor
+    :param path: The name
+    """
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        # Only with a folder does this follow the link in /proc
+        os.link(f"/proc/self/fd/{descriptor}", path, src_dir_fd=folder, follow_symlinks=True)
+    finally:
+        os.close(folder)
+
+
+def check_archive(place: Place, needed: tuple[str, ...]) -> None:
+    """
+    Check a saved model before anything of it is used: every part is there, and each has the checksum it was saved with.
+
+    :param place: A path or an open file
+    :param needed: Names of parts that must be there
+    :raises ValueError: If it is not a saved model, or a damaged one
+    """
+    file: Any = open_path(place, "r", suffix="zip")
+    begin = file.tell()
+    try:
+        with zipfile.ZipFile(file) as archive:
+            missing = [name for name in needed if name not in archive.namelist()]
+            damaged = archive.testzip()
+    # What zipfile raises where bytes that it relies on are others than they were
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, zlib.error) as error:
+        raise ValueError(f"{place} is damaged, or not a saved model: {error}") from error
+    finally:
+        if isinstance(place, (str, Path)):
+            file.close()
+        else:
+            file.seek(begin)
+    if damaged is not None:
+        raise ValueError(f"{place} is damaged: the checksum of its part {damaged!r} is wrong")
+    if missing:
+        raise ValueError(f"{place} is not a saved model, or not a whole one: it has no {', '.join(missing)}")
