@@ -74,9 +74,7 @@ class Slots:
         """
         self.totals += rewards
         self.check("The reward", rewards)
-        for key, part in obs.items() if isinstance(obs, dict) else (("", obs),):
-            if part.dtype.kind == "f":
-                self.check(f"The observation {key!r}" if key else "The observation", part)
+        self.check_observations(obs)
         self.clock += 1
         if self.clock > self.deadline:
             late = int(np.argmax(self.active & (self.begun + self.max_episode_steps == self.deadline)))
@@ -84,6 +82,17 @@ class Slots:
                 f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps "
                 f"({self.describe(late)}): give the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
             )
+
+    def check_observations(self, obs: Any) -> None:
+        """
+        Check observations.
+
+        :param obs: Those of the environments
+        :raises ValueError: As ``add``
+        """
+        for key, part in obs.items() if isinstance(obs, dict) else (("", obs),):
+            if part.dtype.kind == "f":
+                self.check(f"The observation {key!r}" if key else "The observation", part)
 
     def check(self, name: str, values: np.ndarray) -> None:
         """
@@ -162,6 +171,7 @@ def evaluate(
     for queue in queues(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         slots = Slots(queue, env.num_envs, max_episode_steps)
         obs = start(env, slots.pairs, seeds)
+        slots.check_observations(obs)
         begun = list(range(len(slots.pairs)))
         while slots.n_active:
             if begun:

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 from uuid import uuid4
 
 from stable_baselines3.common.save_util import open_path
@@ -27,12 +27,13 @@ def whole_or_not_at_all(place: Place) -> Iterator[io.BytesIO]:
 
     :param place: A path, to which ``.zip`` is added where it has no suffix, or a file opened for writing
     """
+    file = None if isinstance(place, (str, Path)) else open_path(place, "w")
     buffer = io.BytesIO()
     yield buffer
-    if isinstance(place, (str, Path)):
-        replace(path_of(Path(place)), buffer.getvalue())
+    if file is None:
+        replace(path_of(Path(cast(Any, place))), buffer.getvalue())
     else:
-        open_path(place, "w").write(buffer.getvalue())
+        file.write(buffer.getvalue())
 
 
 def path_of(path: Path) -> Path:

@@ -1,0 +1,42 @@
+"""Both algorithms, small: what is promised of one is promised of the other."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_reinforce import REINFORCE, FiniteDifference
+
+# One of each kind of update
+KINDS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any]]] = {
+    "steps": (REINFORCE, {"n_steps": 8}),
+    "episodes": (REINFORCE, {"n_episodes": 2, "baseline": "none"}),
+    "search": (FiniteDifference, {"n_delta": 2, "estimator": "central", "common_random_numbers": False}),
+}
+
+
+def make(kind: str, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:
+    """
+    A small model.
+
+    :param kind: Which one
+    :param env: The environment
+    :param policy: The policy
+    :param kwargs: Further arguments
+    """
+    algorithm, arguments = KINDS[kind]
+    fixed = {"device": "cpu", "policy_kwargs": {"net_arch": [4]}}
+    return algorithm(policy, env, **{**fixed, **arguments, **kwargs})  # type: ignore[call-arg]
+
+
+def plain(state: Any) -> Any:
+    """
+    The numbers of nested states, to compare them.
+
+    :param state: As of ``get_parameters``
+    """
+    if isinstance(state, dict):
+        return [(str(key), plain(value)) for key, value in sorted(state.items(), key=lambda item: str(item[0]))]
+    if isinstance(state, (list, tuple)):
+        return [plain(value) for value in state]
+    return state.numpy().tobytes() if isinstance(state, th.Tensor) else repr(state)

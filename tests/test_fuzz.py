@@ -1,0 +1,240 @@
+"""
+Random configurations: a valid one trains, stays finite and keeps exact books; an invalid one names an argument.
+
+``FUZZ_EXAMPLES=10000 pytest tests/test_fuzz.py`` tries ten thousand of each instead of a hundred.
+"""
+
+import os
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+from sb3_reinforce import REINFORCE, FiniteDifference
+
+N_EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", 100))
+fuzzed = settings(
+    max_examples=N_EXAMPLES,
+    deadline=None,
+    derandomize=N_EXAMPLES == 100,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+)
+
+
+class Any(gym.Env):
+    """
+    Any spaces, episodes of drawn lengths, which it counts.
+
+    :param observation_space: A space
+    :param action_space: A space
+    :param longest: The longest length
+    :param truncate: Whether episodes end by truncation
+    """
+
+    def __init__(self, observation_space, action_space, longest, truncate):
+        self.observation_space, self.action_space = observation_space, action_space
+        self.longest, self.truncate, self.n_steps, self.n_episodes = longest, truncate, 0, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.length = 0, int(self.np_random.integers(1, self.longest + 1))
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.t, self.n_steps = self.t + 1, self.n_steps + 1
+        done = self.t == self.length
+        self.n_episodes += done
+        reward = float(self.np_random.normal() * 10 ** self.np_random.integers(-3, 4))
+        return self.observation_space.sample(), reward, done and not self.truncate, done and self.truncate, {}
+
+
+class Books(BaseCallback):
+    """Checks at each step and rollout what can be counted."""
+
+    def _on_step(self):
+        envs = self.training_env.get_attr("unwrapped")
+        assert self.num_timesteps == sum(env.n_steps for env in envs)
+        return True
+
+    def _on_rollout_end(self):
+        model = self.model
+        if isinstance(model, REINFORCE):
+            buffer, n_envs = model.rollout_buffer, model.n_envs
+            assert buffer.full and buffer.rewards.shape == (buffer.buffer_size, n_envs)
+            assert model.n_steps in (None, buffer.buffer_size)
+            for rows in (buffer.rewards, buffer.advantages, buffer.returns, buffer.log_probs):
+                assert rows.shape == buffer.rewards.shape and np.isfinite(rows).all()
+
+
+sizes = st.integers(1, 3)
+boxes = st.builds(lambda n, high: spaces.Box(-high, high, (n,)), sizes, st.sampled_from([1.0, 10.0]))
+flat = st.one_of(
+    boxes,
+    st.builds(lambda n, m: spaces.Box(0, 1, (n, m), np.float64), sizes, sizes),
+    st.builds(lambda n: spaces.Discrete(n), sizes),
+    st.builds(lambda n: spaces.MultiDiscrete([n, 2]), sizes),
+    st.builds(lambda n: spaces.MultiBinary(n), sizes),
+)
+observations = st.one_of(flat, st.dictionaries(st.sampled_from(["a", "b"]), flat, min_size=1).map(spaces.Dict))
+actions = st.one_of(
+    boxes,
+    st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(2, 4), st.integers(-2, 2)),
+    st.builds(lambda n: spaces.MultiDiscrete([n, 2]), st.integers(2, 3)),
+    st.builds(lambda n: spaces.MultiBinary(n), sizes),
+)
+floats = st.floats
+
+
+@st.composite
+def environments(draw):
+    observation_space, action_space = draw(observations), draw(actions)
+    longest, truncate, n_envs = draw(st.integers(1, 6)), draw(st.booleans()), draw(st.integers(1, 4))
+    make = lambda: Monitor(Any(observation_space, action_space, longest, truncate))  # noqa: E731
+    env = DummyVecEnv([make] * n_envs)
+    if isinstance(observation_space, spaces.Box):
+        wrapper = draw(st.sampled_from(["none", "normalize", "both"]))
+        env = env if wrapper == "none" else VecNormalize(env)
+        env = VecFrameStack(env, 2) if wrapper == "both" and len(observation_space.shape) == 1 else env
+    env.seed(draw(st.integers(0, 99)))
+    return env
+
+
+COMMON = {
+    "learning_rate": st.one_of(floats(0, 1), st.builds(lambda top: lambda p: top * p, floats(0, 1))),
+    "max_grad_norm": st.one_of(st.none(), floats(0.01, 10)),
+    "seed": st.integers(0, 2**31),
+}
+OF_REINFORCE = COMMON | {
+    "gamma": floats(0, 1),
+    "ent_coef": floats(0, 1),
+    "vf_coef": floats(0, 1),
+    "baseline": st.sampled_from(["none", "mean", "time_mean", "leave_one_out", "value", "optimal"]),
+    "reward_to_go": st.booleans(),
+    "discount_scores": st.booleans(),
+    "normalize_by": st.sampled_from(["steps", "episodes"]),
+    "n_critic_updates": st.integers(1, 3),
+    "batch_size": st.integers(1, 64),
+    "normalize_advantage": st.booleans(),
+}
+OF_SEARCH = COMMON | {
+    "estimator": st.sampled_from(["regression", "central", "forward"]),
+    "perturbation": st.sampled_from(["sphere", "gaussian", "rademacher", "coordinate"]),
+    "n_delta": st.integers(2, 5),
+    "delta_std": st.one_of(st.none(), floats(1e-3, 1), st.just(lambda p: 0.1 + p)),
+    "n_eval_episodes": st.integers(1, 2),
+    "common_random_numbers": st.booleans(),
+    "standardize_utilities": st.booleans(),
+    "deterministic": st.booleans(),
+}
+
+
+@st.composite
+def reinforce_arguments(draw):
+    chosen = draw(st.fixed_dictionaries({}, optional=OF_REINFORCE))
+    whole = draw(st.booleans())
+    # Without a critic some episode must end: the longest has 6 steps
+    n_steps = draw(st.integers(1, 9)) if chosen.get("baseline", "value") == "value" else draw(st.integers(6, 9))
+    return {**chosen, **({"n_episodes": draw(st.integers(2, 6))} if whole else {"n_steps": n_steps})}
+
+
+def policy_for(env):
+    return "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+
+
+def assert_trains(algorithm, env, arguments):
+    model = algorithm(policy_for(env), env, device="cpu", policy_kwargs={"net_arch": [4]}, **arguments)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Episodes that n_steps cuts are left out")
+        warnings.filterwarnings("ignore", "n_delta=. perturbations do not determine")
+        model.learn(30, Books())
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    inner = env.get_attr("unwrapped")
+    assert model.num_timesteps == sum(each.n_steps for each in inner) >= 30
+    n_episodes = sum(each.n_episodes for each in inner)
+    if algorithm is REINFORCE and model.n_steps is not None:
+        assert len(model.ep_info_buffer) == min(n_episodes, 100)
+        assert model.num_timesteps == model._n_updates * model.n_steps * env.num_envs
+    elif algorithm is REINFORCE:
+        assert len(model.ep_info_buffer) == min(model._n_updates * model.n_episodes, 100)
+    else:
+        used = len(model._candidates) and model._n_updates * len(np.concatenate(model._candidates))
+        assert len(model.ep_info_buffer) == min(used * model.n_eval_episodes, 100) <= n_episodes
+
+
+@fuzzed
+@given(environments(), reinforce_arguments())
+def test_valid_reinforce(env, arguments):
+    assert_trains(REINFORCE, env, arguments)
+
+
+@fuzzed
+@given(environments(), st.fixed_dictionaries({"n_delta": OF_SEARCH["n_delta"]}, optional=OF_SEARCH))
+def test_valid_search(env, arguments):
+    assert_trains(FiniteDifference, env, arguments)
+
+
+nan, inf = float("nan"), float("inf")
+no_number = st.sampled_from(["x", None, [1], nan, inf, -inf, True, 1j, b"1", object()])
+negative = floats(max_value=-1e-6, allow_nan=False)
+no_flag = st.one_of(st.sampled_from(["no", None, nan, []]), st.integers(), floats())
+no_name = st.one_of(st.text(max_size=3), st.sampled_from([None, 3, nan, b"mean"]))
+positive_integer = st.one_of(no_number, st.integers(max_value=0), floats())
+WRONG_COMMON = {
+    "learning_rate": st.one_of(no_number, negative, no_number.map(lambda value: lambda p: value)),
+    "max_grad_norm": st.one_of(no_number.filter(lambda value: value is not None), negative, st.just(0)),
+    "max_episode_steps": positive_integer,
+    "seed": st.one_of(no_number.filter(lambda value: value is not None), st.integers(max_value=-1)),
+    "stats_window_size": positive_integer,
+    "verbose": st.one_of(no_number, st.integers(max_value=-1)),
+    "policy_kwargs": st.sampled_from([3, "x", [1], nan]),
+    "tensorboard_log": st.sampled_from([3, nan, [1]]),
+}
+WRONG_REINFORCE = WRONG_COMMON | {
+    "gamma": st.one_of(no_number, negative, floats(min_value=1.001)),
+    "gae_lambda": st.one_of(no_number, negative, floats(min_value=1.001)),
+    "ent_coef": st.one_of(no_number, negative),
+    "vf_coef": st.one_of(no_number, negative),
+    "n_steps": positive_integer.filter(lambda value: value is not None),
+    "n_episodes": positive_integer.filter(lambda value: value is not None),
+    "baseline": no_name,
+    "reward_to_go": no_flag,
+    "discount_scores": no_flag,
+    "normalize_by": no_name,
+    "n_critic_updates": positive_integer,
+    "batch_size": positive_integer,
+    "temperature": st.one_of(no_number, negative, st.just(0)),
+    "min_std": st.one_of(no_number, negative),
+    "normalize_advantage": no_flag,
+    "use_sde": no_flag,
+    "sde_sample_freq": st.one_of(no_number, st.integers(max_value=-2), floats()),
+}
+WRONG_SEARCH = WRONG_COMMON | {
+    "estimator": no_name,
+    "perturbation": no_name,
+    "n_delta": positive_integer.filter(lambda value: value is not None),
+    "n_top": positive_integer.filter(lambda value: value is not None),
+    "delta_std": st.one_of(no_number.filter(lambda value: value is not None), negative, st.just(0)),
+    "n_eval_episodes": positive_integer,
+    "common_random_numbers": no_flag,
+    "standardize_utilities": no_flag,
+    "deterministic": no_flag,
+}
+
+
+@pytest.mark.parametrize(("algorithm", "wrong"), [(REINFORCE, WRONG_REINFORCE), (FiniteDifference, WRONG_SEARCH)])
+@fuzzed
+@given(data=st.data())
+def test_an_invalid_argument_is_named(algorithm, wrong, data):
+    name = data.draw(st.sampled_from(sorted(wrong)))
+    value = data.draw(wrong[name])
+    with pytest.raises((TypeError, ValueError), match=name):
+        algorithm("MlpPolicy", "CartPole-v1", device="cpu", **{name: value})

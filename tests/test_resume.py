@@ -1,0 +1,96 @@
+"""Saving, loading into a fresh process and going on is bit for bit never having stopped."""
+
+import hashlib
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from models import KINDS, make, plain
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
+
+TOTAL = 3200
+
+
+class StopAfterHalf(BaseCallback):
+    """Stops when the first rollout of the second half begins."""
+
+    def _on_step(self):
+        return self.num_timesteps <= TOTAL // 2
+
+
+def environment(seed):
+    return VecNormalize(make_vec_env("Pendulum-v1", 2, seed=seed))
+
+
+def finish(model, env):
+    """The second half: the environments are reset, and seeded as in any other process that does this."""
+    env.seed(7)
+    model.set_env(env)
+    model.learn(TOTAL - model.num_timesteps, reset_num_timesteps=False)
+    return digest(model, env)
+
+
+def digest(model, env):
+    """Everything that must not differ."""
+    episodes = [(episode["r"], episode["l"]) for episode in model.ep_info_buffer]
+    state = {
+        "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
+        "episodes": episodes,
+        "generator": hashlib.sha256(th.get_rng_state().numpy().tobytes()).hexdigest(),
+        "numpy": float(np.random.random()),
+    }
+    for name, part in model.get_parameters().items():
+        state[name] = hashlib.sha256(pickle.dumps(plain(part))).hexdigest()
+    for name in ("obs_rms", "ret_rms"):
+        rms = getattr(env, name)
+        state[name] = [np.asarray(part).tolist() for part in (rms.mean, rms.var, rms.count)]
+    return state
+
+
+def go_on(kind, folder):
+    """What a fresh process does."""
+    env = VecNormalize.load(str(folder / "statistics.pkl"), make_vec_env("Pendulum-v1", 2, seed=11))
+    algorithm = KINDS[kind][0]
+    model = algorithm.load(folder / "model", env=env, device="cpu", restore_random_state=True)
+    (folder / "end.pkl").write_bytes(pickle.dumps(finish(model, env)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
+    schedules = {"learning_rate": LinearSchedule(1e-3, 0, 1)}
+    if kind == "steps":
+        schedules["ent_coef"] = LinearSchedule(0.01, 0, 1)
+    if kind == "search":
+        schedules |= {"deterministic": False, "delta_std": LinearSchedule(0.1, 0.01, 1)}
+    env = environment(3)
+    model = make(kind, env, seed=3, **schedules)
+    model.learn(TOTAL, StopAfterHalf())
+    assert TOTAL // 2 < model.num_timesteps < TOTAL and model._n_updates > 0
+    model.save(tmp_path / "model")
+    env.save(tmp_path / "statistics.pkl")
+    here = Path(__file__)
+    code = f"import sys; sys.path.insert(0, {str(here.parent)!r}); import pathlib, test_resume as t; "
+    code += f"t.th.set_num_threads(1); t.go_on({kind!r}, pathlib.Path({str(tmp_path)!r}))"
+    expected = finish(model, env)
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert pickle.loads((tmp_path / "end.pkl").read_bytes()) == expected
+
+
+def test_without_the_argument_the_generators_are_left_alone(tmp_path):
+    model = make("steps")
+    model.save(tmp_path / "model")
+    th.manual_seed(5)
+    expected = th.rand(3)
+    th.manual_seed(5)
+    state = th.get_rng_state()
+    KINDS["steps"][0].load(tmp_path / "model", device="cpu", restore_random_state=True)
+    assert not th.equal(state, th.get_rng_state())
+    th.manual_seed(5)
+    assert th.equal(th.rand(3), expected)

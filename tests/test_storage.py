@@ -1,0 +1,273 @@
+"""A model is saved whole or not at all, a damaged file is told, and parameters are taken all or none."""
+
+import io
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor
+from models import KINDS, make, plain
+from stable_baselines3 import A2C
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_reinforce import storage
+
+both = pytest.mark.parametrize("kind", ["steps", "search"])
+
+
+class Lock:
+    """What cannot be pickled."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+
+
+def interrupt(*args, **kwargs):
+    raise KeyboardInterrupt
+
+
+def disk_full(*args, **kwargs):
+    raise OSError(28, "No space left on device")
+
+
+@both
+@pytest.mark.parametrize("fault", ["unpicklable attribute", "interrupt", "disk full", "replace"])
+@pytest.mark.parametrize("as_path", [str, Path])
+def test_a_save_that_fails_leaves_the_old_file_and_no_other(as_path, fault, kind, tmp_path, monkeypatch):
+    model = make(kind)
+    model.save(tmp_path / "model.zip")
+    before = (tmp_path / "model.zip").read_bytes()
+    if fault == "unpicklable attribute":
+        model.lock = Lock()
+    else:
+        place, what = {"interrupt": (th, "save"), "disk full": (os, "fsync"), "replace": (os, "replace")}[fault]
+        monkeypatch.setattr(place, what, interrupt if fault == "interrupt" else disk_full)
+    with pytest.raises((TypeError, OSError, KeyboardInterrupt)):
+        model.save(as_path(tmp_path / "model"))
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["model.zip"] and (tmp_path / "model.zip").read_bytes() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "O_TMPFILE"), reason="needs files without a name")
+@pytest.mark.parametrize("at", ["th.save", "os.fsync"])
+def test_a_process_that_is_killed_while_it_saves(at, tmp_path):
+    make("steps").save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+    code = f"""
+import os, signal
+import torch as th
+from sb3_reinforce import REINFORCE
+model = REINFORCE.load({str(tmp_path / "model")!r}, device="cpu")
+{at} = lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGKILL)
+model.save({str(tmp_path / "model")!r})
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    assert os.listdir(tmp_path) == ["model.zip"] and (tmp_path / "model.zip").read_bytes() == before
+
+
+def test_a_file_system_without_nameless_files(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "O_TMPFILE", raising=False)
+    storage.replace(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new" and os.listdir(tmp_path) == ["file"]
+    monkeypatch.setattr(os, "fsync", disk_full)
+    with pytest.raises(OSError, match="No space left"):
+        storage.replace(tmp_path / "file", b"newer")
+    assert (tmp_path / "file").read_bytes() == b"new" and os.listdir(tmp_path) == ["file"]
+
+
+@both
+def test_callbacks_save_through_it(kind, tmp_path):
+    env = Monitor(Corridor())
+    for callback in (
+        EvalCallback(env, eval_freq=4, best_model_save_path=tmp_path, verbose=0, warn=False),
+        CheckpointCallback(4, tmp_path, name_prefix="best", verbose=0),
+    ):
+        model = make(kind, Corridor())
+        model.save(tmp_path / "best_model")
+        before = (tmp_path / "best_model.zip").read_bytes()
+        model.lock = Lock()
+        with pytest.raises(TypeError, match="pickle"):
+            model.learn(64, callback=callback)
+        assert os.listdir(tmp_path) == ["best_model.zip"] and (tmp_path / "best_model.zip").read_bytes() == before
+
+
+def test_where_it_saves(tmp_path, monkeypatch):
+    """As Stable-Baselines3: .zip where there is no suffix, folders are made, a folder of that name is left alone."""
+    model = make("steps")
+    model.save(tmp_path / "new" / "folder" / "model")
+    model.save(str(tmp_path / "model.pkl"))
+    (tmp_path / "taken.zip").mkdir()
+    with pytest.warns(UserWarning, match="is a folder"):
+        model.save(tmp_path / "taken")
+    monkeypatch.chdir(tmp_path)
+    model.save("here")
+    os.symlink(tmp_path / "here.zip", tmp_path / "link.zip")
+    model.save("link")
+    assert (tmp_path / "link.zip").is_symlink()
+    names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert names == {"new/folder/model.zip", "model.pkl", "taken.zip_2", "here.zip", "link.zip"}
+    for name in names:
+        KINDS["steps"][0].load(tmp_path / name, device="cpu")
+    assert (tmp_path / "here.zip").stat().st_mode == (tmp_path / "new").stat().st_mode & 0o666 | 0o100000
+
+
+@both
+def test_files_that_are_open(kind, tmp_path):
+    model, buffer = make(kind), io.BytesIO()
+    model.save(buffer)
+    buffer.seek(0)
+    loaded = KINDS[kind][0].load(buffer, device="cpu")
+    assert all(map(th.equal, model.policy.parameters(), loaded.policy.parameters()))
+    with open(tmp_path / "model", "wb") as file:
+        model.save(file)
+    KINDS[kind][0].load(tmp_path / "model", device="cpu")
+    with pytest.raises(TypeError, match="invalid type"):
+        model.save(3)
+    model.lock, empty = Lock(), io.BytesIO()
+    with pytest.raises(TypeError, match="pickle"):
+        model.save(empty)
+    assert empty.getvalue() == b""
+
+
+@both
+def test_a_damaged_file_is_told(kind, tmp_path):
+    """Whatever byte is another: either nothing of the model depends on it, or loading says that the file is damaged."""
+    model, path = make(kind), tmp_path / "model.zip"
+    model.save(path)
+    content, parts = path.read_bytes(), zipfile.ZipFile(path).namelist()
+    damaged = [b"", b"x" * 1000, content[: len(content) // 2], content[:-1]]
+    with zipfile.ZipFile(path) as archive:
+        for part in parts:
+            # A zip file repeats the name before the content
+            middle = content.index(part.encode(), archive.getinfo(part).header_offset) + len(part) + 40
+            damaged.append(content[:middle] + bytes([content[middle] ^ 0xFF]) + content[middle + 1 :])
+    for content in damaged:
+        path.write_bytes(content)
+        for load in (KINDS[kind][0].load, model.set_parameters):
+            with pytest.raises(ValueError, match=r"model\.zip is damaged"):
+                load(path)
+
+
+def test_no_flipped_byte_changes_a_parameter_unnoticed(tmp_path):
+    model, path = make("steps"), tmp_path / "model.zip"
+    model.save(path)
+    content, other = path.read_bytes(), make("steps")
+    start = model.get_parameters()["policy"]
+    noticed = 0
+    for i in np.random.default_rng(0).integers(len(content), size=150):
+        path.write_bytes(content[:i] + bytes([content[i] ^ 0xFF]) + content[i + 1 :])
+        try:
+            other.set_parameters(path)
+        except ValueError:
+            noticed += 1
+        else:
+            assert all(th.equal(value, start[name]) for name, value in other.get_parameters()["policy"].items())
+    assert noticed > 75
+
+
+@both
+@pytest.mark.parametrize("part", ["data", "policy.pth"])
+def test_a_file_without_one_of_its_parts(part, kind, tmp_path):
+    make(kind).save(tmp_path / "whole")
+    with zipfile.ZipFile(tmp_path / "whole.zip") as whole, zipfile.ZipFile(tmp_path / "part.zip", "w") as rest:
+        for name in whole.namelist():
+            if name != part:
+                rest.writestr(name, whole.read(name))
+    with pytest.raises(ValueError, match=rf"part is not a saved model, or not a whole one: it has no {part}"):
+        KINDS[kind][0].load(tmp_path / "part")
+    with pytest.raises(FileNotFoundError):
+        KINDS[kind][0].load(tmp_path / "nothing")
+
+
+def last_key(state):
+    return list(state)[-1]
+
+
+WRONG = {
+    "an unknown name": lambda p: {**p, "foo": {}},
+    "a method's name": lambda p: {**p, "learn": {}},
+    "no optimizer": lambda p: {"policy": p["policy"]},
+    "no dict": lambda p: {**p, "policy.optimizer": 3},
+    "another shape": lambda p: {**p, "policy": {**p["policy"], last_key(p["policy"]): th.zeros(77)}},
+    "a key less": lambda p: {**p, "policy": {k: v for k, v in p["policy"].items() if k != last_key(p["policy"])}},
+    "not finite": lambda p: {**p, "policy": {k: v * float("nan") for k, v in p["policy"].items()}},
+    "another optimizer's groups": lambda p: {
+        **p,
+        "policy.optimizer": {**p["policy.optimizer"], "param_groups": [{"params": [0]}] * 2},
+    },
+    "another optimizer's settings": lambda p: {
+        **p,
+        "policy.optimizer": {
+            "state": {},
+            "param_groups": [{"params": p["policy.optimizer"]["param_groups"][0]["params"], "lr": 0.1, "alpha": 0.9}],
+        },
+    },
+}
+
+
+@both
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("exact_match", [True, False])
+def test_wrong_parameters_change_nothing_at_all(exact_match, wrong, kind):
+    model, other = make(kind, Corridor()).learn(32), make(kind, Corridor(), seed=1).learn(64)
+    before = plain(model.get_parameters())
+    states = WRONG[wrong](other.get_parameters())
+    may_pass = not exact_match and wrong in ("an unknown name", "a method's name", "no optimizer", "a key less")
+    if may_pass:
+        model.set_parameters(states, exact_match=False)
+        return
+    with pytest.raises((ValueError, TypeError, RuntimeError)):
+        model.set_parameters(states, exact_match=exact_match)
+    assert plain(model.get_parameters()) == before
+    model.learn(64, reset_num_timesteps=False)
+
+
+def test_the_optimizer_of_a2c_is_refused_and_named():
+    states = A2C("MlpPolicy", Corridor(), device="cpu").learn(16).get_parameters()
+    model = make("steps", Corridor(), policy_kwargs={})
+    with pytest.raises(ValueError, match=r"'policy.optimizer'.*Adam.*betas.*another optimizer"):
+        model.set_parameters(states, exact_match=False)
+    del states["policy.optimizer"]
+    model.set_parameters(states, exact_match=False)
+    assert all(map(th.equal, model.policy.state_dict().values(), states["policy"].values()))
+
+
+class Malicious:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@both
+def test_parameters_are_read_without_running_code(kind, tmp_path):
+    """``load`` runs pickled code, as in Stable-Baselines3; ``set_parameters`` reads tensors alone."""
+    model = make(kind)
+    model.trap = Malicious(tmp_path / "ran")
+    model.save(tmp_path / "model")
+    fresh = make(kind)
+    fresh.set_parameters(tmp_path / "model")
+    assert not (tmp_path / "ran").exists()
+    assert all(map(th.equal, model.policy.parameters(), fresh.policy.parameters()))
+    with zipfile.ZipFile(tmp_path / "model.zip") as whole, zipfile.ZipFile(tmp_path / "trap.zip", "w") as trap:
+        pickled = io.BytesIO()
+        th.save(model.trap, pickled)
+        for name in whole.namelist():
+            trap.writestr(name, pickled.getvalue() if name == "policy.pth" else whole.read(name))
+    with pytest.raises(pickle.UnpicklingError):
+        fresh.set_parameters(tmp_path / "trap")
+    assert not (tmp_path / "ran").exists()
+    KINDS[kind][0].load(tmp_path / "model", device="cpu")
+    assert (tmp_path / "ran").exists()
