@@ -20,7 +20,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce import optimization, persistence
-from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_basics, check_function, check_learn
+from sb3_reinforce.arguments import (
+    MAX_LEARNING_RATE,
+    CheckedSchedule,
+    check_basics,
+    check_flag,
+    check_function,
+    check_learn,
+)
 from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.collection import check_data, collect, shift_to_start, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
@@ -153,6 +160,7 @@ class REINFORCE(OnPolicyAlgorithm):
         _init_setup_model: bool = True,
     ):
         check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
+        check_flag("use_sde", use_sde)
         if env is not None or _init_setup_model:
             env = check_env(env, verbose)
         super().__init__(
