@@ -15,8 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_reinforce.comparisons import gram
-from sb3_reinforce.gradient_statistics import moments, signal_to_noise
+from sb3_reinforce.gradient_statistics import gram, moments, signal_to_noise
 from sb3_reinforce.reinforce import REINFORCE
 
 

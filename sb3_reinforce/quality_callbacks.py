@@ -13,8 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import by_step
-from sb3_reinforce.comparisons import functions_of, gram
-from sb3_reinforce.gradient_statistics import moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.comparisons import functions_of
+from sb3_reinforce.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
 from sb3_reinforce.pitfalls import PITFALLS, Seen, Update
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
