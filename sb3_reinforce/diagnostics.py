@@ -10,7 +10,8 @@ from sb3_reinforce.estimator_comparison import EstimatorRow, compare_estimators
 from sb3_reinforce.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.gradient_statistics import GradientStatistics, gradient_statistics
 from sb3_reinforce.landscapes import Landscape, landscape
-from sb3_reinforce.quality_callbacks import GradientQualityCallback, PitfallCallback
+from sb3_reinforce.pitfall_callback import PitfallCallback
+from sb3_reinforce.quality_callback import GradientQualityCallback
 from sb3_reinforce.sampling import sample
 from sb3_reinforce.scores import gradients_by_episode
 from sb3_reinforce.tables import Table
