@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.actors import plain_layers
+from sb3_reinforce.layers import actor_layers
 from sb3_reinforce.policies import Parameters, as_policy_actions, overrides
 from sb3_reinforce.rollouts import Rollout, select
 
@@ -28,9 +28,9 @@ def factored_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     The actor's layers, if the scores of its parameters have factors.
 
     :param policy: The policy
-    :return: As ``plain_layers``; None also where ``evaluate_actions`` is overridden or two layers share a parameter
+    :return: As ``actor_layers``; None also where ``evaluate_actions`` is overridden or two layers share a parameter
     """
-    layers = plain_layers(policy)
+    layers = actor_layers(policy)
     if layers is None or overrides(policy, "evaluate_actions"):
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]

@@ -14,10 +14,10 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from sb3_reinforce.arguments import check_integer, check_number
-from sb3_reinforce.comparisons import BaselineRow
-from sb3_reinforce.landscapes import Landscape
+from sb3_reinforce.diagnostics.comparisons import BaselineRow
+from sb3_reinforce.diagnostics.landscapes import Landscape
+from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.returns import Floats
-from sb3_reinforce.tables import Table
 
 # Colours that readers with any colour vision tell apart (Okabe and Ito, 2008)
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")

@@ -12,9 +12,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baseline_gradients import componentwise_residuals
 from sb3_reinforce.baselines import BASELINES
 from sb3_reinforce.diagnostics import compare_baselines, gradient_statistics, gradients_by_episode, sample
+from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals
 from sb3_reinforce.scores import episode_gradients
 
 

@@ -13,8 +13,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.diagnostics.rollout_errors import return_by_definition
 from sb3_reinforce.returns import lambda_return
-from sb3_reinforce.rollout_errors import return_by_definition
 
 ACTION_SPACES = [
     spaces.Discrete(3),

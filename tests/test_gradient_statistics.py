@@ -7,8 +7,8 @@ import torch as th
 from environments import Tree
 from test_enumeration import LOGITS, episode_terms, log_pi
 
-from sb3_reinforce.bootstrap import interval, resamples
-from sb3_reinforce.gradient_statistics import (
+from sb3_reinforce.diagnostics.bootstrap import interval, resamples
+from sb3_reinforce.diagnostics.gradient_statistics import (
     Moments,
     gradient_statistics,
     moments,

@@ -16,9 +16,9 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.bootstrap import resamples
-from sb3_reinforce.comparisons import baseline_rows, compare_baselines, functions_of
 from sb3_reinforce.diagnostics import sample
+from sb3_reinforce.diagnostics.bootstrap import resamples
+from sb3_reinforce.diagnostics.comparisons import baseline_rows, compare_baselines, functions_of
 from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -9,13 +9,13 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.collection import by_step
-from sb3_reinforce.pitfalls import PITFALLS
+from sb3_reinforce.diagnostics.pitfalls import PITFALLS
+from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.diagnostics.updates import Seen, Update
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout, select, take
-from sb3_reinforce.sampling import check_model
 from sb3_reinforce.scores import flat, scored_parameters
-from sb3_reinforce.updates import Seen, Update
 
 
 class PitfallCallback(BaseCallback):

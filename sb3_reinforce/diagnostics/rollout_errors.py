@@ -6,10 +6,10 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
 from sb3_reinforce.collection import by_step
 from sb3_reinforce.critic import stack
-from sb3_reinforce.policy_errors import relative
+from sb3_reinforce.diagnostics.policy_errors import relative
+from sb3_reinforce.diagnostics.sampling import Infos
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.sampling import Infos
 from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 
 

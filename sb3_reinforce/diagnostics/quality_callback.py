@@ -10,12 +10,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import by_step
-from sb3_reinforce.comparisons import functions_of
-from sb3_reinforce.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.comparisons import functions_of
+from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.sampling import check_model
 from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.sampling import check_model
 from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.weighing import check_baseline
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import torch as th
 
 from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.baseline_gradients import grams
 from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.bootstrap import UNKNOWN, Estimate, interval, resamples
-from sb3_reinforce.gradient_statistics import moments, signal_to_noise, variance
+from sb3_reinforce.diagnostics.baseline_gradients import grams
+from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
+from sb3_reinforce.diagnostics.gradient_statistics import moments, signal_to_noise, variance
+from sb3_reinforce.diagnostics.sampling import check_model, sample
+from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.sampling import check_model, sample
-from sb3_reinforce.tables import Table
 from sb3_reinforce.weighing import check_baseline
 
 

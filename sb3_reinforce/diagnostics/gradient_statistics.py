@@ -16,7 +16,7 @@ from typing import TypeAlias
 import torch as th
 
 from sb3_reinforce.arguments import check_integer, check_number
-from sb3_reinforce.bootstrap import Estimate, interval, resamples
+from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 
 
 @dataclass(frozen=True)
