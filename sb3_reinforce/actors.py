@@ -2,9 +2,9 @@
 How a policy acts while a rollout is collected.
 
 ``GeneralActor`` asks the policy itself, whatever it is. ``LaidOutActor`` is the same actor for the usual case, a
-plain MLP on flat observations, as a few NumPy operations: on a handful of observations PyTorch's modules and
-distributions take far longer than the arithmetic. Both draw from the same distribution, but not the same actions for
-the same seed: the laid-out one draws its noise for many steps at once, in the form that the distribution needs.
+plain MLP on flat observations, as a few NumPy operations. Both draw from the same distribution, but not the same
+actions for the same seed: the laid-out one draws its noise for many steps at once, in the form that the distribution
+needs.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,8 +12,6 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
@@ -21,35 +19,30 @@ from stable_baselines3.common.distributions import (
     MultiCategoricalDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, overrides
+from sb3_reinforce.layers import Floats, actor_layers, lay_out
+from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, tells_values
 from sb3_reinforce.rollouts import flatten
 
-Floats: TypeAlias = NDArray[np.float32]
 # Actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
-# What a subclass may have changed on the way from an observation to an action
-ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
 # Actions for which noise is drawn at once
 NOISE_ROWS = 1024
-# Products beyond which NumPy's BLAS starts threads of its own, whatever number the user has set for PyTorch
-ONE_THREAD = 2**18
 
 
 class GeneralActor:
     """
-    Acts through the policy: through its ``forward`` if it has one of its own, else through the actor alone.
+    Acts through the policy: through its ``forward`` where that is to tell V too, else through the actor alone.
 
     :param policy: Any policy
+    :param with_values: Whether to tell V(s) and log π(a|s) along with the actions
     """
 
-    def __init__(self, policy: ActorCriticPolicy):
-        self.policy, self.device, self.shape = policy, policy.device, policy.action_space.shape or ()
-        self.has_own_forward = overrides(policy, "forward")
+    def __init__(self, policy: ActorCriticPolicy, with_values: bool):
+        self.policy, self.with_values = policy, with_values
+        self.device, self.shape = policy.device, policy.action_space.shape or ()
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
@@ -59,7 +52,7 @@ class GeneralActor:
         :param obs: Observations of ``n_envs`` environments, an array or a dict of arrays
         """
         obs = obs_as_tensor(obs, self.device)
-        if not self.has_own_forward:
+        if not self.with_values:
             return self.policy.get_distribution(obs).get_actions().cpu().numpy().reshape(-1, *self.shape), None, None
         actions, values, log_prob = self.policy(obs)
         return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
@@ -82,13 +75,13 @@ class LaidOutActor:
     Acts by NumPy: the layers one after the other, and noise drawn beforehand.
 
     :param policy: A policy whose actor is a plain MLP
-    :param layers: Its layers, as ``plain_layers`` gives them, with the parameters that they have now
+    :param layers: Its layers, as ``actor_layers`` gives them, with the parameters that they have now
     :param n_envs: Number of observations at a time
     """
 
     def __init__(self, policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int):
         self.policy, self.shape = policy, (n_envs, *(policy.action_space.shape or ()))
-        self.functions = [as_function(layer, n_envs) for layer in layers]
+        self.forward = lay_out(layers, n_envs)
         self.sample, self.noise = make_sampler(policy), make_noise(policy, n_envs)
         self.outputs: list[Floats] = []
 
@@ -98,11 +91,9 @@ class LaidOutActor:
 
         :param obs: Observations of ``n_envs`` environments
         """
-        x = obs.reshape(len(obs), -1).astype(np.float32, copy=False)
-        for function in self.functions:
-            x = function(x)
-        self.outputs.append(x)
-        return self.sample(x, next(self.noise)).reshape(self.shape), None, None
+        outputs = self.forward(obs)
+        self.outputs.append(outputs)
+        return self.sample(outputs, next(self.noise)).reshape(self.shape), None, None
 
     @th.no_grad()
     def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
@@ -119,54 +110,18 @@ class LaidOutActor:
         return distribution.proba_distribution(outputs, *log_std).log_prob(steps).numpy()
 
 
-def make_actor(policy: ActorCriticPolicy, n_envs: int) -> GeneralActor | LaidOutActor:
+def make_actor(policy: ActorCriticPolicy, n_envs: int, with_critic: bool) -> GeneralActor | LaidOutActor:
     """
     The fastest way to act with a policy, as long as its parameters stay as they are.
 
     :param policy: The policy
     :param n_envs: Number of observations at a time
+    :param with_critic: Whether V(s) will be needed
     """
-    layers = plain_layers(policy)
-    return GeneralActor(policy) if layers is None else LaidOutActor(policy, layers, n_envs)
-
-
-def plain_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
-    """
-    The actor's layers, if all that it does is to apply linear layers, tanh and ReLU to flat observations.
-
-    :param policy: The policy
-    :return: The layers from the observation to the parameters of the action distribution; None if the policy is another
-        kind, is compiled, overrides a method on the way, or carries forward hooks
-    """
-    if any(overrides(policy, method) for method in ACTOR_METHODS) or type(policy.mlp_extractor) is not MlpExtractor:
-        return None
-    space, extractor = policy.observation_space, policy.pi_features_extractor
-    layers = [*policy.mlp_extractor.policy_net, policy.action_net]
-    is_plain = (
-        isinstance(space, spaces.Box)
-        and not is_image_space(space)
-        and type(extractor) is FlattenExtractor
-        and not policy.use_sde
-        and all(type(layer) in (th.nn.Linear, th.nn.Tanh, th.nn.ReLU) for layer in layers)
-        and not any(module._forward_hooks or module._forward_pre_hooks for module in (policy, extractor, *layers))
-    )
-    return layers if is_plain else None
-
-
-def as_function(layer: th.nn.Module, n: int) -> Callable[[Floats], Floats]:
-    """
-    A layer as a function of arrays of shape ``(n, n_in)``.
-
-    :param layer: ``Linear``, ``Tanh`` or ``ReLU``
-    :param n: Number of rows
-    """
-    if isinstance(layer, th.nn.Linear):
-        weight, bias = layer.weight.detach().T.contiguous().cpu(), layer.bias.detach().cpu()
-        if n * weight.numel() > ONE_THREAD:
-            return lambda x: th.addmm(bias, th.as_tensor(x), weight).numpy()
-        weights, biases = weight.numpy(), bias.numpy()
-        return lambda x: x @ weights + biases
-    return np.tanh if isinstance(layer, th.nn.Tanh) else lambda x: np.maximum(x, 0)
+    layers = actor_layers(policy)
+    if layers is None:
+        return GeneralActor(policy, tells_values(policy, with_critic))
+    return LaidOutActor(policy, layers, n_envs)
 
 
 def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:

@@ -46,6 +46,7 @@ def collect(
     callback: BaseCallback,
     rollout_buffer: RolloutBuffer,
     extent: Extent,
+    with_critic: bool,
 ) -> Ends | None:
     """
     Step the environments and write what happens into a rollout buffer, with one actor pass a step.
@@ -55,11 +56,12 @@ def collect(
     :param callback: Called at each step, with the locals that the callbacks of Stable-Baselines3 read
     :param rollout_buffer: The rollout buffer; it grows where it is too small and keeps one row per step
     :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
+    :param with_critic: Whether V(s) will be needed
     :return: How the episodes ended; None if the callback stopped the collection
     :raises ValueError: If an episode that is waited for does not end
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
-    policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs), 0
+    policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
     as_env_actions, step = env_actions_of(policy), stepper(env)
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
@@ -124,7 +126,7 @@ def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarr
     space = policy.action_space
     if isinstance(space, spaces.Box):
         low, high = space.low, space.high
-        return policy.unscale_action if policy.squash_output else lambda actions: np.clip(actions, low, high)
+        return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(low, high)
     if np.any(getattr(space, "start", 0)):
         return lambda actions: shift_to_start(space, actions)
     return lambda actions: actions

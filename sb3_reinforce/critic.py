@@ -1,18 +1,20 @@
 """The critic: its values along a rollout, and its regression on the returns by an optimizer of its own."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
 
 from sb3_reinforce import optimization
 from sb3_reinforce.collection import Ends
-from sb3_reinforce.policies import Parameters, overrides
+from sb3_reinforce.layers import critic_layers, lay_out
+from sb3_reinforce.policies import Parameters, overrides_critic, tells_values
 from sb3_reinforce.returns import Floats
 from sb3_reinforce.rollouts import flatten, take
 
@@ -20,16 +22,19 @@ from sb3_reinforce.rollouts import flatten, take
 @th.no_grad()
 def values_of(policy: ActorCriticPolicy, buffer: RolloutBuffer) -> np.ndarray:
     """
-    V(s_t) in one batch, or as a policy that overrides ``forward`` has told it step by step.
+    V(s_t) in one batch, or as it was told along with the actions.
 
     :param policy: The policy
     :param buffer: The rollout buffer
     :return: Shape ``(n_steps, n_envs)``, float32
     """
-    if overrides(policy, "forward"):
+    if tells_values(policy, with_critic=True):
         return buffer.values
+    layers, shape = critic_layers(policy), buffer.rewards.shape
+    if layers is not None and policy.device.type == "cpu":
+        return lay_out(layers, buffer.rewards.size)(buffer.observations).reshape(shape)
     obs = flatten(obs_as_tensor(buffer.observations, policy.device))
-    return policy.predict_values(obs).reshape(buffer.rewards.shape).cpu().numpy()
+    return policy.predict_values(obs).reshape(shape).cpu().numpy()
 
 
 @th.no_grad()
@@ -93,10 +98,30 @@ def fit_critic(
     if not parameters:
         return 0.0
     losses = []
+    inputs, predict_values = what_learns(policy, parameters, obs)
     for _ in range(n_updates):
         for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]
-            loss = F.mse_loss(policy.predict_values(take(obs, batch)).flatten(), returns[batch])
+            loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])
             gradients = th.autograd.grad(loss, parameters)
             optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
             losses.append(loss.detach())
     return float(th.stack(losses).mean())
+
+
+def what_learns(
+    policy: ActorCriticPolicy, parameters: Parameters, obs: PyTorchObs
+) -> tuple[PyTorchObs, Callable[[Any], th.Tensor]]:
+    """
+    The critic without a features extractor that its passes leave as it is: its features are the same in all of them.
+
+    :param policy: The policy
+    :param parameters: The parameters that the critic's passes change
+    :param obs: ``n`` observations
+    :return: ``n`` observations or features, and V as a function of as many of them as one likes
+    """
+    extractor, changed = policy.vf_features_extractor, {id(parameter) for parameter in parameters}
+    if overrides_critic(policy) or any(id(parameter) in changed for parameter in extractor.parameters()):
+        return obs, policy.predict_values
+    with th.no_grad():
+        features = BasePolicy.extract_features(policy, obs, extractor)
+    return features, lambda features: policy.value_net(policy.mlp_extractor.forward_critic(features))

@@ -14,10 +14,17 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from sb3_reinforce.arguments import check_integer, check_number
-from sb3_reinforce.comparisons import BaselineRow
-from sb3_reinforce.landscapes import Landscape
+from sb3_reinforce.diagnostics.comparisons import BaselineRow
+from sb3_reinforce.diagnostics.landscapes import Landscape
+from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.returns import Floats
-from sb3_reinforce.tables import Table
+
+# Colours that readers with any colour vision tell apart (Okabe and Ito, 2008)
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+# Those that are seen on the blue, green and yellow of a landscape
+ON_LANDSCAPE = ("#FFFFFF", "#D55E00", "#CC79A7", "#000000", "#E69F00")
+# For print in grey
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -43,12 +50,15 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     rows = [row for row in table if row.baseline != "floor"]
     values = np.array([row.variance.value for row in rows])
     ends = np.array([[row.variance.low for row in rows], [row.variance.high for row in rows]])
-    ax.barh([row.baseline for row in rows], values, color="tab:blue", alpha=0.6)
-    ax.hlines(range(len(rows)), *ends, color="black", linewidth=1.5)
-    ax.axvline(table["floor"].variance.value, color="tab:red", linestyle="--", label="component-wise optimal constant")
+    # On a logarithmic axis a bar has no foot to be compared from
+    ax.hlines(range(len(rows)), *ends, color=COLOURS[0], linewidth=2)
+    ax.plot(values, range(len(rows)), linestyle="", marker=MARKERS[0], color=COLOURS[0])
+    ax.set_yticks(range(len(rows)), [row.baseline for row in rows])
+    ax.axvline(table["floor"].variance.value, color=COLOURS[3], linestyle="--", label="best constant per component")
     ax.invert_yaxis()
-    ax.set(xscale="log", xlabel="trace of the covariance of one episode's gradient", title=table.title)
-    ax.legend()
+    ax.grid(axis="x", alpha=0.3)
+    ax.set(xscale="log", xlabel="variance of one episode's gradient", title=table.title)
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), frameon=False)
     return ax
 
 
@@ -107,7 +117,7 @@ def plot_learning_curves(
     ax, x = new_axes(ax), np.asarray(timesteps, dtype=float)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
-    for name, given in runs.items():
+    for index, (name, given) in enumerate(runs.items()):
         scores = np.asarray(given, dtype=float)
         if scores.ndim not in (2, 3) or len(scores) < 2 or scores.shape[-1:] != x.shape:
             raise ValueError(
@@ -117,7 +127,7 @@ def plot_learning_curves(
         curve, low, high = interquartile_interval(
             scores.reshape(len(scores), -1, len(x)), n_resamples, confidence, seed
         )
-        (line,) = ax.plot(x, curve, label=f"{name} ({len(scores)} runs)")
+        (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
     ax.set(xlabel="environment steps", ylabel="interquartile mean of the return")
     ax.legend()
@@ -138,15 +148,18 @@ def plot_variances(
     """
     ax, x = new_axes(ax), np.asarray(n_episodes, dtype=float)
     width = NormalDist().inv_cdf((1 + check_number("confidence", confidence, 0, 1)) / 2)
-    for name, given in curves.items():
+    for index, (name, given) in enumerate(curves.items()):
         variances = np.asarray(given, dtype=float)
         mean, error = variances.mean(axis=0), variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
-        (line,) = ax.plot(x, mean, marker="o", markersize=3, label=name)
-        ax.fill_between(x, mean - width * error, mean + width * error, color=line.get_color(), alpha=0.2)
+        # Side by side: bands or bars at the same place would hide each other
+        shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
+        colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
+        ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
     ax.minorticks_off()
-    ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    ax.grid(axis="y", alpha=0.3)
+    ax.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
     return ax
 
 
@@ -163,19 +176,17 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
     for index, (name, (x, y)) in enumerate(scape.steps.items()):
         ax.quiver(
-            0,
-            0,
-            x,
-            y,
+            *(0, 0, x, y),
             angles="xy",
             scale_units="xy",
             scale=2,
-            color=f"C{index + 1}",
-            edgecolor="white",
+            color=ON_LANDSCAPE[index % len(ON_LANDSCAPE)],
+            edgecolor="black",
             linewidth=0.5,
+            width=0.015,
             label=name,
         )
     ax.set(xlabel="first direction", ylabel="second direction", aspect="equal")
     if scape.steps:
-        ax.legend()
+        ax.legend(loc="lower left", fontsize="small", facecolor="0.85")
     return ax

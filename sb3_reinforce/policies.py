@@ -36,6 +36,31 @@ def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th
     return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions.float()
 
 
+def tells_values(policy: ActorCriticPolicy, with_critic: bool) -> bool:
+    """
+    Whether V(s) is told along with the actions.
+
+    Either the policy overrides ``forward``, or V is needed and actor and critic share a features extractor that has
+    parameters: a pass for V alone would evaluate it a second time.
+
+    :param policy: The policy
+    :param with_critic: Whether V is needed
+    """
+    if overrides(policy, "forward"):
+        return True
+    is_shared = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
+    return with_critic and is_shared and not overrides_critic(policy)
+
+
+def overrides_critic(policy: ActorCriticPolicy) -> bool:
+    """
+    Whether the policy's class has its own way from an observation to V.
+
+    :param policy: The policy
+    """
+    return overrides(policy, "predict_values") or overrides(policy, "extract_features")
+
+
 def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
     log π(a|s) and the entropy of π(·|s), without evaluating the critic.
@@ -46,12 +71,31 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
     :return: Two tensors of shape ``(n,)``. Where the entropy has no closed form (squashed output) it is estimated by
         −log π(a|s)
     """
-    if overrides(policy, "evaluate_actions"):
-        _, log_prob, entropy = policy.evaluate_actions(obs, actions)
+    return evaluate(policy, obs, actions, with_values=False)[:2]
+
+
+def evaluate(
+    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, with_values: bool
+) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    """
+    log π(a|s), the entropy of π(·|s), and V(s) if asked for, with one pass of a features extractor that is shared.
+
+    :param policy: The policy
+    :param obs: ``n`` observations
+    :param actions: As ``as_policy_actions`` gives them
+    :param with_values: Whether to evaluate the critic
+    :return: As ``log_prob_and_entropy``, and V(s), shape ``(n,)``
+    """
+    values: th.Tensor | None = None
+    if overrides(policy, "evaluate_actions") or (with_values and not overrides_critic(policy)):
+        values, log_prob, entropy = policy.evaluate_actions(obs, actions)
     else:
         distribution = policy.get_distribution(obs)
         log_prob, entropy = distribution.log_prob(actions), distribution.entropy()
-    return log_prob, -log_prob if entropy is None else entropy
+        if with_values:
+            values = policy.predict_values(obs)
+    entropy = -log_prob if entropy is None else entropy
+    return log_prob, entropy, values.flatten() if with_values and values is not None else None
 
 
 def split_parameters(

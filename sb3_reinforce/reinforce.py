@@ -36,8 +36,8 @@ from sb3_reinforce.guards import guarded
 from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.policies import (
     Parameters,
+    evaluate,
     floor_std,
-    log_prob_and_entropy,
     set_temperature,
     split_parameters,
 )
@@ -299,7 +299,7 @@ class REINFORCE(OnPolicyAlgorithm):
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
         self._rollout = None
         try:
-            ends = collect(self, env, callback, rollout_buffer, extent)
+            ends = collect(self, env, callback, rollout_buffer, extent, self.has_critic)
             if ends is None:
                 return False
             check_data(rollout_buffer, self._last_obs, ends.terminal_obs)
@@ -336,12 +336,11 @@ class REINFORCE(OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
-        log_prob, entropy = log_prob_and_entropy(self.policy, steps.observations, steps.actions)
+        log_prob, entropy, values = evaluate(self.policy, steps.observations, steps.actions, with_values=bool(shared))
         policy_loss = -(steps.weights * log_prob).sum() / self._denominator(rollout)
         entropy_loss = -entropy.sum() / self._denominator(rollout)
         loss = policy_loss + ent_coef * entropy_loss
-        if shared:
-            values = self.policy.predict_values(steps.observations).flatten()
+        if values is not None:
             loss = loss + self.vf_coef * F.mse_loss(values, steps.returns)
         gradient = th.autograd.grad(loss, actor, allow_unused=True)
         grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")

@@ -1,4 +1,4 @@
-"""Gradients of log π along the episodes of a rollout: all at once, or from one backward pass an episode."""
+"""Gradients of log π along the episodes of a rollout: all at once, or from one backward pass for each episode."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -7,6 +7,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_reinforce.mlp_scores import factored_layers, mlp_gradients
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy, reached
 from sb3_reinforce.rollouts import Rollout, flatten, select, take
 
@@ -58,19 +59,22 @@ def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHU
     ``Σ_t w_t ∇θ log π(a_t|s_t)`` over the used steps of each episode, for each of k weights: ``episode_gradients``
     without a backward pass an episode.
 
-    Episodes are cut into pieces of equal length, whose vector-Jacobian products ``torch.func.vmap`` takes side by side.
-    A policy that it cannot trace (one that branches on its data, say) is differentiated episode by episode instead.
+    For a plain MLP see ``mlp_scores``. Otherwise episodes are cut into pieces of equal length, whose vector-Jacobian
+    products ``torch.func.vmap`` takes side by side. A policy that it cannot trace (one that branches on its data, say)
+    is differentiated episode by episode instead.
 
     :param rollout: The rollout, with m episodes that have used steps
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
-    :param chunk: Floats that the gradients of pieces may take besides the result; memory, not the result, depends on it
+    :param chunk: Floats that an intermediate may take besides the result; memory, not the result, depends on it
     :return: Shape ``(k, m, n)``; θ as in ``episode_gradients``
     :raises ValueError: If log π does not depend on any parameter in a way that can be differentiated
     """
     policy, used = rollout.policy, rollout.used
+    parameters, layers = scored_parameters(rollout), factored_layers(policy)
+    if layers is not None:
+        return mlp_gradients(rollout, layers, parameters, weights, chunk)
     obs = select(rollout.observations, used)
     actions = as_policy_actions(select(rollout.actions, used), policy.action_space)
-    parameters = scored_parameters(rollout)
     episode, slots, filled = pieces_of(rollout.episodes[used])
     w = th.stack([select(weight, used) for weight in weights]).to(parameters[0])
     w = (w[:, slots] * filled.to(w)).transpose(0, 1)

@@ -9,7 +9,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_noise, make_sampler, plain_layers
+from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_noise, make_sampler
+from sb3_reinforce.layers import actor_layers
 
 SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
 N_DRAWS = 4000
@@ -32,7 +33,7 @@ def test_without_noise_it_is_the_mode(space, activation_fn, monkeypatch):
     obs = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
     zeros = iter([np.zeros((50, policy.action_net.out_features), dtype=np.float32)])
     monkeypatch.setattr("sb3_reinforce.actors.make_noise", lambda *args: zeros)
-    actions, _, _ = LaidOutActor(policy, plain_layers(policy), 50).act(obs)
+    actions, _, _ = LaidOutActor(policy, actor_layers(policy), 50).act(obs)
     with th.no_grad():
         mode = policy.get_distribution(obs_as_tensor(obs, "cpu")).mode().numpy()
     np.testing.assert_allclose(actions, mode.reshape(50, *space.shape), rtol=1e-5, atol=1e-6)
@@ -45,7 +46,9 @@ def test_actions_are_drawn_from_the_policys_distribution(space, actor):
     """The mean score of the draws is 0 to within its standard error: for no other distribution is E[∇ log π] = 0."""
     policy = make_policy(space)
     obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
-    act = (LaidOutActor(policy, plain_layers(policy), N_DRAWS) if actor == "laid out" else GeneralActor(policy)).act
+    act = (
+        LaidOutActor(policy, actor_layers(policy), N_DRAWS) if actor == "laid out" else GeneralActor(policy, False)
+    ).act
     actions = th.as_tensor(act(obs)[0]).reshape(N_DRAWS, -1).float()
     actions = actions.flatten() if isinstance(space, spaces.Discrete) else actions
     distribution = policy.get_distribution(obs_as_tensor(obs[:1], "cpu"))
@@ -62,7 +65,7 @@ def test_actions_are_drawn_from_the_policys_distribution(space, actor):
 def test_both_give_the_same_log_probabilities(space):
     policy = make_policy(space)
     obs = np.random.default_rng(0).normal(size=(6, 3, 5)).astype(np.float32)
-    laid_out, general = LaidOutActor(policy, plain_layers(policy), 3), GeneralActor(policy)
+    laid_out, general = LaidOutActor(policy, actor_layers(policy), 3), GeneralActor(policy, False)
     actions = np.stack([laid_out.act(row)[0].reshape(3, -1) for row in obs])
     np.testing.assert_allclose(laid_out.log_prob(obs, actions), general.log_prob(obs, actions), rtol=1e-5)
 
@@ -84,15 +87,15 @@ class Changed(ActorCriticPolicy):
 
 
 def test_whatever_is_not_plain_goes_the_general_way():
-    assert plain_layers(make_policy()) is not None
-    assert plain_layers(make_policy(policy=Changed)) is None
-    assert plain_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
-    assert plain_layers(make_policy(temperature=0.5)) is None
-    assert plain_layers(make_policy(SPACES[3], use_sde=True)) is None
-    assert plain_layers(th.compile(make_policy(), backend="eager")) is None
+    assert actor_layers(make_policy()) is not None
+    assert actor_layers(make_policy(policy=Changed)) is None
+    assert actor_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
+    assert actor_layers(make_policy(temperature=0.5)) is None
+    assert actor_layers(make_policy(SPACES[3], use_sde=True)) is None
+    assert actor_layers(th.compile(make_policy(), backend="eager")) is None
     hooked = make_policy()
     hooked.mlp_extractor.policy_net[0].register_forward_hook(lambda module, inputs, output: output * 0)
-    assert plain_layers(hooked) is None
+    assert actor_layers(hooked) is None
 
 
 def test_each_rollout_acts_with_the_parameters_of_the_last_update():

@@ -1,6 +1,7 @@
 """Baselines compared on the same episodes: against closed forms on a bandit, and on CartPole."""
 
-import time
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.baselines import BASELINES
-from sb3_reinforce.comparisons import componentwise_residuals
-from sb3_reinforce.diagnostics import compare_baselines, gradients_by_episode, sample
+from sb3_reinforce.diagnostics import compare_baselines, gradient_statistics, gradients_by_episode, sample
+from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals
 from sb3_reinforce.scores import episode_gradients
 
 
@@ -27,30 +28,102 @@ class GaussianBandit(Corridor):
         return self.np_random.normal([3.0, 5.0][action], 2.0)
 
 
-def uniform_bandit(**kwargs):
+def bandit(better=0.5, **kwargs):
+    """A model that takes the better action, of mean 5, with a probability."""
     model = REINFORCE(
-        "MlpPolicy", make_vec_env(GaussianBandit, 4, seed=0), policy_kwargs={"net_arch": []}, device="cpu", **kwargs
+        "MlpPolicy",
+        make_vec_env(GaussianBandit, 4, seed=0),
+        policy_kwargs={"net_arch": []},
+        seed=0,
+        device="cpu",
+        **kwargs,
     )
     with th.no_grad():
         for parameter in model.policy.parameters():
             parameter.zero_()
+        model.policy.action_net.bias.copy_(th.tensor([1 - better, better]).log())
     return model
 
 
-def test_the_bandit_has_its_known_variances_in_order():
+def exact_moments(better):
     """
-    At π = (½, ½) each of four score components is ± ½, so ‖score‖² = 1 and tr Σ = E(r − b)² − ‖E g‖².
+    ``E‖s‖²``, ``E‖s (r − b)‖²`` as a function of b, and ``‖E g‖²``.
 
-    E[r] = 4 and Var r = 4 + 1, so E r² = 21; E g has norm 1, since each component is ± ¼ (3 − 5).
+    The score s has the components 1(a' = a) − π(a') for the weights and again for the biases, so ‖s‖² is 4 times the
+    squared probability of the other action. A reward of mean μ and variance 4 has E(r − b)² = 4 + (μ − b)².
     """
-    table = compare_baselines(uniform_bandit(baseline="none"), n_episodes=2000, n_resamples=100)
-    none, mean, optimal = (table[name].variance for name in ("none", "mean", "optimal"))
-    for estimate, truth in ((none, 21 - 1), (mean, 5 - 1), (optimal, 5 - 1)):
-        assert estimate.value == pytest.approx(truth, rel=0.1)
-    assert none.low > mean.high
-    assert mean.value >= optimal.value * (1 - 1e-2)
-    assert table["none"].snr.low < 1 / 20 < table["none"].snr.high
-    assert table["mean"].ratio.low < 4 / 20 < table["mean"].ratio.high
+    actions = [(1 - better, 3.0), (better, 5.0)]
+    squares = [4 * (1 - p) ** 2 for p, _ in actions]
+
+    def second(b):
+        return sum(p * square * (4 + (mu - b) ** 2) for (p, mu), square in zip(actions, squares, strict=True))
+
+    signal = 4 * ((5 - 3) * better * (1 - better)) ** 2
+    return sum(p * square for (p, _), square in zip(actions, squares, strict=True)), second, signal
+
+
+@pytest.mark.parametrize(
+    ("better", "none", "mean", "optimal"),
+    [(0.5, 20.0, 4.0, 4.0), (0.8, 9.9584, 3.4816, 2.56), (0.2, 16.1024, 3.4816, 2.56)],
+)
+def test_the_bandit_has_its_known_variances(better, none, mean, optimal):
+    """
+    ``tr Σ = E‖s (r − b)‖² − ‖E g‖²`` with b = 0, b = E r, and the best constant, ``E[‖s‖² r] / E‖s‖²``.
+
+    With p of one action and q of the other the last two are 16 p q (2 − 4 p q) and 16 p q: equal at p = q, and the mean
+    the worse one everywhere else.
+    """
+    scale, second, signal = exact_moments(better)
+    # E‖s (r − b)‖² is a parabola in b with the leading coefficient E‖s‖², so its minimum follows from two values
+    best = 0.5 - (second(1) - second(0)) / (2 * scale)
+    by_formula = [second(b) - signal for b in (0.0, 3 + 2 * better, best)]
+    assert by_formula == pytest.approx([none, mean, optimal])
+    table = compare_baselines(bandit(better), 2000, ("none", "mean", "optimal"), n_resamples=200, confidence=0.99)
+    for name, truth in (("none", none), ("mean", mean), ("optimal", optimal)):
+        assert table[name].variance.low < truth < table[name].variance.high
+        assert table[name].ratio.low <= truth / none <= table[name].ratio.high
+        assert table[name].snr.low < signal / truth < table[name].snr.high
+    assert table["none"].variance.low > 2 * table["mean"].variance.high
+
+
+@pytest.mark.parametrize("better", [0.2, 0.8])
+def test_total_return_is_above_mean_above_optimal_with_intervals_apart(better):
+    """Each interval is of the ratio to the mean on the same resampled episodes."""
+    ratios = {
+        row.baseline: row.ratio for row in compare_baselines(bandit(better), 2000, reference="mean", n_resamples=200)
+    }
+    assert ratios["none"].low > 1 > ratios["optimal"].high
+
+
+def test_with_scores_of_one_length_optimal_is_the_mean_of_the_others():
+    """r_i − r̄ is (N − 1)/N times r_i less the mean of the others: the ratio is the same number in every resample."""
+    for n in (20, 2000):
+        ratio = compare_baselines(bandit(), n, reference="mean", n_resamples=20)["optimal"].ratio
+        assert (ratio.low, ratio.value, ratio.high) == pytest.approx(3 * ((n / (n - 1)) ** 2,), rel=1e-4)
+
+
+@pytest.mark.parametrize("better", [0.5, 0.8])
+def test_batches_of_twenty_have_their_known_variances(better):
+    """
+    The chapter's batches of N = 20: tr Σ / N for the total return. With the mean, a batch's gradient is ``(N − 1)/N``
+    times the sample covariance c of score and reward, and for each component
+    ``N Var c = E[s² (r − E r)²] − (E g)² (N − 2)/(N − 1) + E s² Var r / (N − 1)``.
+    """
+    n, n_batches = 20, 400
+    scale, second, signal = exact_moments(better)
+    of_rewards = 4 + 4 * better * (1 - better)
+    covariance = (second(3 + 2 * better) - signal * (n - 2) / (n - 1) + scale * of_rewards / (n - 1)) / n
+    rollout = sample(bandit(better), n * n_batches)
+    batches = []
+    for episodes in th.unique(rollout.episodes[rollout.used]).split(n):
+        batch = replace(rollout, used=rollout.used & th.isin(rollout.episodes, episodes))
+        weights = [batch.returns - BASELINES[name](batch) for name in ("none", "mean")]
+        batches.append(gradients_by_episode(batch, *weights).mean(1))
+    for gradients, truth in zip(
+        th.stack(batches, dim=1), ((second(0) - signal) / n, covariance * ((n - 1) / n) ** 2), strict=True
+    ):
+        found = gradient_statistics(gradients, confidence=0.999).variance
+        assert found.low < truth < found.high
 
 
 def test_no_constant_can_pass_the_floor():
@@ -99,21 +172,7 @@ def test_bias_is_told_where_theory_knows_it():
     assert table["time_mean"].bias == 1 / 10
     assert np.isnan(table["mean"].bias)
     assert np.isnan(compare_baselines(REINFORCE("MlpPolicy", Tree(True), device="cpu"), 10)["time_mean"].bias)
-    assert compare_baselines(uniform_bandit(), 10)["mean"].bias == 1 / 10
-
-
-def test_the_cost_is_at_most_three_times_that_of_plain_backward_passes():
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 8, seed=0), seed=0, device="cpu")
-    rollout = sample(model, 100)
-
-    def seconds(function):
-        begin = time.process_time()
-        function()
-        return time.process_time() - begin
-
-    plain = min(seconds(lambda: list(episode_gradients(rollout, rollout.returns))) for _ in range(5))
-    ours = min(seconds(lambda: compare_baselines(model, 100)) for _ in range(5))
-    assert ours <= 3 * plain
+    assert compare_baselines(bandit(), 10)["mean"].bias == 1 / 10
 
 
 def test_the_model_is_as_it_was_and_goes_on():
@@ -144,6 +203,14 @@ def test_a_users_function_is_a_row_and_the_table_prints():
         table["mean"]
 
 
+def test_without_pandas_there_is_no_data_frame(monkeypatch):
+    table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pandas"):
+        table.to_pandas()
+    assert str(table)
+
+
 def test_a_table_becomes_a_data_frame():
     pandas = pytest.importorskip("pandas")
     frame = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10).to_pandas()
@@ -159,6 +226,7 @@ def test_a_table_becomes_a_data_frame():
         ({"baselines": ("median",)}, r"baselines must be.*'time_mean'.*got 'median'"),
         ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
         ({"baselines": ("value",)}, "no critic.*'none'"),
+        ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
         ({"n_resamples": 0}, "n_resamples"),
         ({"confidence": 2.0}, "confidence"),
     ],

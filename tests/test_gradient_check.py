@@ -12,8 +12,8 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.check_errors import return_by_definition
 from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.diagnostics.rollout_errors import return_by_definition
 from sb3_reinforce.returns import lambda_return
 
 ACTION_SPACES = [

@@ -7,13 +7,12 @@ import torch as th
 from environments import Tree
 from test_enumeration import LOGITS, episode_terms, log_pi
 
-from sb3_reinforce.gradient_statistics import (
+from sb3_reinforce.diagnostics.bootstrap import interval, resamples
+from sb3_reinforce.diagnostics.gradient_statistics import (
     Moments,
     gradient_statistics,
-    interval,
     moments,
     noise_scale,
-    resamples,
     signal_to_noise,
     variance,
 )

@@ -10,8 +10,8 @@ from test_enumeration import make_model, true_gradient
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
-from sb3_reinforce.estimator_comparison import likelihood_ratio
-from sb3_reinforce.landscapes import CandidateUtility, filter_normalized
+from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
+from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
 
 
 def bandit(algorithm=REINFORCE, **kwargs):

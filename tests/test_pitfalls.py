@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import PitfallCallback
-from sb3_reinforce.pitfalls import PITFALLS
+from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 
 
 def noise(t, action):

@@ -62,5 +62,5 @@ with open(arguments.output / "variance_vs_episodes.csv", "w", newline="") as fil
 for index, name in enumerate(BASELINES):
     print(f"{name:14s}", *(f"{variance:10.1f}" for variance in variances[:, :, index].mean(0)))
 ax = plot_variances({name: variances[:, :, index] for index, name in enumerate(BASELINES)}, SIZES)
-ax.set_title(f"CartPole-v1, MlpPolicy after {model.num_timesteps} steps")
+ax.set_title(f"CartPole-v1 after {model.num_timesteps:,} steps of training")
 ax.figure.savefig(arguments.output / "variance_vs_episodes.png", dpi=150)

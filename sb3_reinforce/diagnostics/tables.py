@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any, Generic, TypeVar
 
-from sb3_reinforce.gradient_statistics import Estimate
+from sb3_reinforce.diagnostics.bootstrap import Estimate
 
 Row = TypeVar("Row")
 

@@ -7,7 +7,6 @@ a pitfall that is reported is there, one that is not may still be.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
@@ -15,54 +14,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_reinforce.comparisons import gram
-from sb3_reinforce.gradient_statistics import moments, signal_to_noise
-from sb3_reinforce.reinforce import REINFORCE
-
-
-@dataclass(frozen=True)
-class Update:
-    """
-    What training knew of one update.
-
-    :param kl: The mean of log π_old − log π_new over steps of the rollout, how far the policy moved
-    :param entropy: Mean entropy of the policy; NaN where it is not known
-    :param std: Mean standard deviation of a Gaussian policy; NaN for other policies
-    :param grad_norm: Norm of the gradient before clipping
-    :param explained_variance: Of the critic; NaN without one
-    :param gradient: Some components of the gradient, shape ``(c,)``
-    :param return_scale: Root mean square of the returns
-    :param n_episodes: Episodes in the rollout, cut ones too
-    :param n_steps: Steps used
-    :param used_fraction: Share of the steps that were used
-    """
-
-    kl: float
-    entropy: float
-    std: float
-    grad_norm: float
-    explained_variance: float
-    gradient: th.Tensor
-    return_scale: float
-    n_episodes: int
-    n_steps: int
-    used_fraction: float
-
-
-@dataclass(frozen=True)
-class Seen:
-    """
-    What a pitfall is detected from.
-
-    :param model: The model
-    :param updates: The last updates, at most 50
-    :param n_updates: All updates so far
-    """
-
-    model: REINFORCE
-    updates: list[Update]
-    n_updates: int
-
+from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.updates import Seen, Update
 
 Pitfall: TypeAlias = Callable[[Seen], str | None]
 

@@ -1,8 +1,5 @@
-"""What is watched while a model trains: the quality of its gradient, and the pitfalls that it may have fallen into."""
+"""The quality of the gradient, logged while a model trains."""
 
-import math
-import warnings
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import cast
@@ -13,14 +10,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import by_step
-from sb3_reinforce.comparisons import functions_of, gram
-from sb3_reinforce.gradient_statistics import moments, noise_scale, signal_to_noise, variance
-from sb3_reinforce.pitfalls import PITFALLS, Seen, Update
-from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.diagnostics.comparisons import functions_of
+from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout, select, take
-from sb3_reinforce.sampling import check_model
-from sb3_reinforce.scores import flat, gradients_by_episode, scored_parameters
+from sb3_reinforce.rollouts import Rollout
+from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.weighing import check_baseline
 
 
@@ -121,93 +117,3 @@ def first_episodes(rollout: Rollout, n_episodes: int) -> Rollout:
         return rollout
     kept = numbers[th.linspace(0, len(numbers) - 1, n_episodes).round().long()]
     return replace(rollout, used=rollout.used & th.isin(rollout.episodes, kept))
-
-
-class PitfallCallback(BaseCallback):
-    """
-    Says once, in a warning, which of the known pitfalls training has fallen into, and which argument to change.
-
-    The pitfalls are those of ``pitfalls.PITFALLS``. They are read from what training has logged and computed anyway;
-    the cost is two forward passes and a backward pass over at most 256 steps of a rollout, and nothing of the training
-    is changed.
-
-    :param verbose: Verbosity level
-    :raises TypeError: If the model is not a REINFORCE
-    """
-
-    # Steps behind a KL divergence, and components of a gradient that are kept
-    N_STEPS, N_COMPONENTS = 256, 10_000
-
-    def __init__(self, verbose: int = 0):
-        super().__init__(verbose)
-        self.found: dict[str, str] = {}
-        self.updates: deque[Update] = deque(maxlen=50)
-        self.n_updates = 0
-        self.rollout: Rollout | None = None
-        self.parameters: Parameters = []
-
-    def _init_callback(self) -> None:
-        check_model(self.model)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        model = cast(REINFORCE, self.model)
-        rollout = self.rollout = cast(Rollout, model._rollout)
-        self.parameters = self.parameters or scored_parameters(rollout)
-        log_prob = self.log_prob(rollout)
-        weights = th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)) * rollout.discounts
-        weighed = (log_prob * weights[rollout.used][: len(log_prob)].to(log_prob)).sum()
-        gradient = flat(th.autograd.grad(weighed, self.parameters))
-        self.before, self.gradient = log_prob.detach(), gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
-
-    def _on_rollout_start(self) -> None:
-        self.look()
-
-    def _on_training_end(self) -> None:
-        self.look()
-
-    def log_prob(self, rollout: Rollout) -> th.Tensor:
-        """
-        log π of the first used steps of a rollout, now.
-
-        :param rollout: The rollout
-        """
-        steps = th.arange(min(self.N_STEPS, int(rollout.used.sum())))
-        actions = as_policy_actions(take(select(rollout.actions, rollout.used), steps), self.model.action_space)
-        return log_prob_and_entropy(rollout.policy, take(select(rollout.observations, rollout.used), steps), actions)[0]
-
-    def look(self) -> None:
-        """Take in the update that has followed the last rollout, and report what is new."""
-        if self.rollout is None or not self.logger.name_to_value:
-            return
-        self.updates.append(self.update(self.rollout))
-        self.n_updates, self.rollout = self.n_updates + 1, None
-        seen = Seen(cast(REINFORCE, self.model), list(self.updates), self.n_updates)
-        for name, pitfall in PITFALLS.items():
-            sentence = pitfall(seen) if name not in self.found else None
-            if sentence is not None:
-                self.found[name] = sentence
-                warnings.warn(sentence, stacklevel=2)
-
-    def update(self, rollout: Rollout) -> Update:
-        """
-        What training knows of its last update.
-
-        :param rollout: The rollout that it was made from
-        """
-        logged, used = self.logger.name_to_value, rollout.used
-        change = self.before - self.log_prob(rollout).detach()
-        return Update(
-            kl=float(change.mean()),
-            entropy=-logged.get("train/entropy_loss", math.nan),
-            std=logged.get("train/std", math.nan),
-            grad_norm=logged.get("train/grad_norm", math.nan),
-            explained_variance=logged.get("train/explained_variance", math.nan),
-            gradient=self.gradient,
-            return_scale=float(rollout.returns[used].square().mean().sqrt()),
-            n_episodes=len(th.unique(rollout.episodes[used])),
-            n_steps=int(used.sum()),
-            used_fraction=float(used.double().mean()),
-        )

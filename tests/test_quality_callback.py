@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import Logger, configure
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import GradientQualityCallback
-from sb3_reinforce.quality_callbacks import first_episodes
+from sb3_reinforce.diagnostics.quality_callback import first_episodes
 from sb3_reinforce.scores import episode_gradients
 
 

@@ -15,7 +15,7 @@ from sb3_reinforce import parameters
 from sb3_reinforce.arguments import check_integer, check_number
 from sb3_reinforce.candidate_actors import make_actor
 from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.sampling import undisturbed
+from sb3_reinforce.diagnostics.sampling import undisturbed
 
 
 class CandidateUtility:

@@ -16,6 +16,7 @@ from typing import TypeAlias
 import torch as th
 
 from sb3_reinforce.arguments import check_integer, check_number
+from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 
 
 @dataclass(frozen=True)
@@ -35,24 +36,6 @@ Statistic: TypeAlias = Callable[[Moments], th.Tensor]
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """
-    A number that was estimated.
-
-    :param value: The estimate
-    :param low: Lower end of its interval
-    :param high: Upper end of its interval
-    """
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
-
-
-@dataclass(frozen=True)
 class GradientStatistics:
     """
     What ``gradient_statistics`` returns.
@@ -69,6 +52,18 @@ class GradientStatistics:
     snr: Estimate
     noise_scale: Estimate
     cosine: Estimate | None
+
+
+def gram(gradients: th.Tensor) -> th.Tensor:
+    """
+    ``K = g gᵀ``.
+
+    :param gradients: Shape ``(m, n)``
+    :return: Shape ``(m, m)``, float64, on the CPU
+    """
+    gradients = gradients.double()
+    product: th.Tensor = (gradients @ gradients.T).cpu()
+    return product
 
 
 def moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
@@ -144,37 +139,6 @@ def check_gradients(gradients: th.Tensor) -> th.Tensor:
     return gradients.detach().cpu().double()
 
 
-def resamples(m: int, n_resamples: int, seed: int) -> th.Tensor:
-    """
-    How often each of m samples is drawn, in the sample itself (the first row) and in bootstrap resamples of it.
-
-    A resample that holds one sample m times has no pairs and is drawn anew, as if by m samples of which two differ.
-
-    :param m: Number of samples, at least 2
-    :param n_resamples: Number of resamples
-    :param seed: Of the draws: with the same seed, the resamples of two estimators are paired
-    :return: Shape ``(1 + n_resamples, m)``, float64
-    """
-    drawn = th.randint(m, (n_resamples, m), generator=th.Generator().manual_seed(seed))
-    drawn[:, 1] = th.where((drawn == drawn[:, :1]).all(1), (drawn[:, 0] + 1) % m, drawn[:, 1])
-    counts = th.zeros(n_resamples, m, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
-    return th.cat([th.ones(1, m, dtype=th.float64), counts])
-
-
-def interval(values: th.Tensor, confidence: float) -> Estimate:
-    """
-    The percentile interval of the bootstrap (Efron and Tibshirani, 1993, chapter 13).
-
-    :param values: The statistic of the sample, then of its resamples, shape ``(1 + r,)``
-    :param confidence: Probability that the interval is to cover the truth
-    """
-    tail = (1 - confidence) / 2
-    # An end is a value that occurred: infinite noise scales cannot be interpolated
-    low = values[1:].quantile(tail, interpolation="lower")
-    high = values[1:].quantile(1 - tail, interpolation="higher")
-    return Estimate(float(values[0]), float(low), float(high))
-
-
 def cosine(of: Moments, products: th.Tensor) -> th.Tensor:
     """
     ``cos = ⟨E g, r⟩ / (‖E g‖ ‖r‖)`` to a reference r, and 0 where no signal is seen.
@@ -212,8 +176,7 @@ def gradient_statistics(
     gradients = check_gradients(gradients)
     check_number("confidence", confidence, 0, 1)
     counts = resamples(len(gradients), check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
-    gram = gradients @ gradients.T
-    found = moments(gram, counts)
+    found = moments(gram(gradients), counts)
     to_reference = None
     if reference is not None:
         if reference.shape != gradients.shape[1:] or not reference.norm() > 0:

@@ -13,19 +13,19 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce import baselines
 from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.comparisons import UNKNOWN, gram
+from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
+from sb3_reinforce.diagnostics.gradient_statistics import cosine, gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.landscapes import CandidateUtility
+from sb3_reinforce.diagnostics.sampling import sampled
+from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.gradient_statistics import Estimate, cosine, interval, moments, resamples, signal_to_noise
-from sb3_reinforce.landscapes import CandidateUtility
 from sb3_reinforce.parameters import actor_parameters
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.sampling import sampled
 from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.search_settings import default_delta_std, default_n_delta
-from sb3_reinforce.tables import Table
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
 

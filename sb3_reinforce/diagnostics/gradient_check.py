@@ -5,20 +5,14 @@ from dataclasses import dataclass
 import torch as th
 
 from sb3_reinforce.arguments import check_integer
-from sb3_reinforce.check_errors import (
-    log_prob_error,
-    return_error,
-    score_error,
-    sign_error,
-    surrogate_error,
-    weight_error,
-)
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error
+from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
+from sb3_reinforce.diagnostics.sampling import check_model, sampled
+from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.policies import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import select
-from sb3_reinforce.sampling import check_model, sampled
 from sb3_reinforce.scores import scored_parameters
-from sb3_reinforce.tables import Table
 
 
 @dataclass(frozen=True)
