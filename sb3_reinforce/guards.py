@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -36,8 +36,8 @@ def guarded(
                 base = model.env.unwrapped
                 if isinstance(base, SubprocVecEnv):
                     watch(base)
-                if isinstance(base, DummyVecEnv):
-                    stack.enter_context(replaced(base, _save_obs=partial(save_obs, base)))
+                if getattr(type(base), "_save_obs", None) is DummyVecEnv._save_obs:
+                    stack.enter_context(replaced(base, _save_obs=partial(save_obs, cast(DummyVecEnv, base))))
             vec_normalize = model.get_vec_normalize_env()
             if vec_normalize is not None:
                 stack.enter_context(checked(vec_normalize))
@@ -86,7 +86,7 @@ def checked(vec_normalize: VecNormalize) -> Iterator[None]:
         obs, rewards, dones, infos = step_wait()
         check("The reward", rewards, (n_steps,))
         check("The observation", obs, (n_steps,))
-        for i in np.flatnonzero(dones).tolist():
+        for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
             check("The terminal observation", infos[i].get("terminal_observation", 0), (n_steps, i))
         n_steps += 1
         return obs, rewards, dones, infos

@@ -48,7 +48,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        env._save_obs(i, obs)
+        save_obs(env, i, obs)
         try:
             rewards[i] = reward
         except (TypeError, ValueError) as error:
@@ -68,6 +68,13 @@ def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
     :raises ValueError: If the observation is malformed
     """
     rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
-    if rows is None or getattr(obs, "shape", None) != rows.shape[1:] or obs.dtype is not rows.dtype:
-        check_observation(env.observation_space, obs, i)
+    if (
+        type(obs) is np.ndarray
+        and rows is not None
+        and obs.shape == rows.shape[1:]
+        and obs.dtype.kind == rows.dtype.kind
+    ):
+        rows[i] = obs
+        return
+    check_observation(env.observation_space, obs, i)
     DummyVecEnv._save_obs(env, i, obs)
