@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
@@ -14,7 +15,7 @@ from torch.nn import functional as F
 from sb3_reinforce import optimization
 from sb3_reinforce.collection import Ends
 from sb3_reinforce.layers import critic_layers, lay_out
-from sb3_reinforce.policies import Parameters, overrides_critic, tells_values
+from sb3_reinforce.policies import Parameters, overrides, tells_values
 from sb3_reinforce.returns import Floats
 from sb3_reinforce.rollouts import flatten, take
 
@@ -120,7 +121,9 @@ def what_learns(
     :return: ``n`` observations or features, and V as a function of as many of them as one likes
     """
     extractor, changed = policy.vf_features_extractor, {id(parameter) for parameter in parameters}
-    if overrides_critic(policy) or any(id(parameter) in changed for parameter in extractor.parameters()):
+    # In training mode Dropout draws anew for each pass, and BatchNorm looks at each minibatch
+    is_fixed = type(extractor) is FlattenExtractor or not extractor.training
+    if overrides(policy, "predict_values") or not is_fixed or not changed.isdisjoint(map(id, extractor.parameters())):
         return obs, policy.predict_values
     with th.no_grad():
         features = BasePolicy.extract_features(policy, obs, extractor)

@@ -13,16 +13,25 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    MultiCategoricalDistribution,
+)
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 
-from sb3_reinforce.policies import overrides, overrides_critic
+from sb3_reinforce.policies import overrides
 
 Floats: TypeAlias = NDArray[np.float32]
 
-# What a subclass may have changed on the way from an observation to an action
+# What a policy may have changed on the way from an observation to an action, or to V
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
+CRITIC_METHODS = ("forward", "extract_features", "predict_values")
+# What the noise of the laid-out actor can be turned into
+DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
 # Products beyond which NumPy's BLAS starts threads of its own, whatever number the user has set for PyTorch
 ONE_THREAD = 2**18
 
@@ -34,9 +43,9 @@ def actor_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     :param policy: The policy
     :return: None if the actor is not a plain MLP
     """
-    if policy.use_sde or any(overrides(policy, method) for method in ACTOR_METHODS):
+    if type(policy.action_dist) not in DISTRIBUTIONS or any(overrides(policy, method) for method in ACTOR_METHODS):
         return None
-    return plain_layers(policy, policy.pi_features_extractor, lambda mlp: [*mlp.policy_net, policy.action_net])
+    return plain_layers(policy, policy.pi_features_extractor, "policy_net", policy.action_net)
 
 
 def critic_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
@@ -46,34 +55,50 @@ def critic_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     :param policy: The policy
     :return: None if the critic is not a plain MLP
     """
-    if overrides_critic(policy):
+    if any(overrides(policy, method) for method in CRITIC_METHODS):
         return None
-    return plain_layers(policy, policy.vf_features_extractor, lambda mlp: [*mlp.value_net, policy.value_net])
+    return plain_layers(policy, policy.vf_features_extractor, "value_net", policy.value_net)
 
 
 def plain_layers(
-    policy: ActorCriticPolicy,
-    extractor: BaseFeaturesExtractor,
-    layers_of: Callable[[MlpExtractor], list[th.nn.Module]],
+    policy: ActorCriticPolicy, extractor: BaseFeaturesExtractor, net: str, head: th.nn.Module
 ) -> list[th.nn.Module] | None:
     """
     The layers, if all that a policy does is to apply linear layers, tanh and ReLU to flat observations.
 
     :param policy: The policy
     :param extractor: Its features extractor
-    :param layers_of: What follows on it
-    :return: None if there is anything else on the way, or a forward hook
+    :param net: Name of the network that follows in the ``MlpExtractor``
+    :param head: The last layer
+    :return: None if there is anything else on the way, a forward hook or another ``forward``
     """
-    space = policy.observation_space
-    if type(policy.mlp_extractor) is not MlpExtractor or not isinstance(space, spaces.Box) or is_image_space(space):
+    space, mlp = policy.observation_space, policy.mlp_extractor
+    if type(mlp) is not MlpExtractor or not isinstance(space, spaces.Box) or is_image_space(space):
         return None
-    layers = layers_of(policy.mlp_extractor)
-    is_plain = (
-        type(extractor) is FlattenExtractor
-        and all(type(layer) in (th.nn.Linear, th.nn.Tanh, th.nn.ReLU) for layer in layers)
-        and not any(module._forward_hooks or module._forward_pre_hooks for module in (policy, extractor, *layers))
-    )
+    body = getattr(mlp, net)
+    if type(extractor) is not FlattenExtractor or type(body) is not th.nn.Sequential:
+        return None
+    layers = [*body, head]
+    is_plain = all(is_plain_layer(layer) for layer in layers) and not any(map(is_changed, (extractor, body, *layers)))
     return layers if is_plain else None
+
+
+def is_plain_layer(layer: th.nn.Module) -> bool:
+    """
+    Whether a layer is one that ``as_function`` knows.
+
+    :param layer: Any layer
+    """
+    return type(layer) in (th.nn.Tanh, th.nn.ReLU) or (type(layer) is th.nn.Linear and layer.bias is not None)
+
+
+def is_changed(module: th.nn.Module) -> bool:
+    """
+    Whether a module does something else than its class says.
+
+    :param module: Any module
+    """
+    return bool(module._forward_hooks or module._forward_pre_hooks) or "forward" in vars(module)
 
 
 def lay_out(layers: Iterable[th.nn.Module], n: int) -> Callable[[np.ndarray], Floats]:
@@ -105,7 +130,7 @@ def as_function(layer: th.nn.Module, n: int) -> Callable[[Floats], Floats]:
     weights, biases = weight.numpy(), bias.numpy()
 
     def affine(x: Floats) -> Floats:
-        # Shorter forms of the same, x @ weights + biases, take half as long again
+        # Shorter forms of the same, x @ weights + biases, are slower on a few rows
         y: Floats = np.dot(x, weights)
         y += biases
         return y

@@ -17,12 +17,13 @@ Parameters: TypeAlias = list[th.nn.Parameter]
 
 def overrides(policy: ActorCriticPolicy, method: str) -> bool:
     """
-    Whether the policy's class has its own version of a method. A compiled policy has its own ``forward``.
+    Whether the policy has its own version of a method, in its class or set on itself. A compiled policy has its own
+    ``forward``.
 
     :param policy: The policy
     :param method: Name of a method of ``ActorCriticPolicy``
     """
-    return getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
+    return method in vars(policy) or getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
 
 
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
@@ -40,25 +41,26 @@ def tells_values(policy: ActorCriticPolicy, with_critic: bool) -> bool:
     """
     Whether V(s) is told along with the actions.
 
-    Either the policy overrides ``forward``, or V is needed and actor and critic share a features extractor that has
-    parameters: a pass for V alone would evaluate it a second time.
+    Either the policy overrides ``forward``, or ``extract_features``, which Stable-Baselines3 calls there, or V is
+    needed and actor and critic share a features extractor that has parameters: a pass for V alone would evaluate it
+    again.
 
     :param policy: The policy
     :param with_critic: Whether V is needed
     """
-    if overrides(policy, "forward"):
+    if overrides(policy, "forward") or overrides(policy, "extract_features"):
         return True
     is_shared = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
-    return with_critic and is_shared and not overrides_critic(policy)
+    return with_critic and is_shared and not has_parts(policy)
 
 
-def overrides_critic(policy: ActorCriticPolicy) -> bool:
+def has_parts(policy: ActorCriticPolicy) -> bool:
     """
-    Whether the policy's class has its own way from an observation to V.
+    Whether the policy has its own way to its actions or to V, which ``forward`` and ``evaluate_actions`` would pass by.
 
     :param policy: The policy
     """
-    return overrides(policy, "predict_values") or overrides(policy, "extract_features")
+    return overrides(policy, "predict_values") or overrides(policy, "get_distribution")
 
 
 def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -87,7 +89,8 @@ def evaluate(
     :return: As ``log_prob_and_entropy``, and V(s), shape ``(n,)``
     """
     values: th.Tensor | None = None
-    if overrides(policy, "evaluate_actions") or (with_values and not overrides_critic(policy)):
+    has_own = overrides(policy, "evaluate_actions") or overrides(policy, "extract_features")
+    if has_own or (with_values and not has_parts(policy)):
         values, log_prob, entropy = policy.evaluate_actions(obs, actions)
     else:
         distribution = policy.get_distribution(obs)

@@ -65,7 +65,7 @@ class REINFORCE(OnPolicyAlgorithm):
     What an unfinished episode is worth: with ``baseline="value"`` the critic's V is added at a time limit and where
     ``n_steps`` cuts an episode. Without a critic a time limit counts as the end of the episode, and an episode that
     ``n_steps`` cuts is left out: its return is not known. The value network is then never evaluated, except by a policy
-    that overrides ``forward`` or ``evaluate_actions``, and never used.
+    that overrides ``forward``, ``evaluate_actions`` or ``extract_features``, and never used.
 
     The critic has an optimizer of its own, of the policy's ``optimizer_class``, for the parameters that only V depends
     on. A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's
@@ -354,9 +354,10 @@ class REINFORCE(OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:
-            if shared:
-                # Passes that moved the statistics of a shared extractor would be a second step of the policy
-                self.policy.set_training_mode(False)
+            # Passes that moved the statistics of what the actor uses too would be a second step of the policy
+            self.policy.set_training_mode(not shared)
+            if self.policy.share_features_extractor:
+                self.policy.features_extractor.eval()
             update_learning_rate(self.critic_optimizer, critic_rate)
             passes = (self.n_critic_updates, self.batch_size, self.max_grad_norm)
             value_loss = fit_critic(

@@ -88,8 +88,15 @@ class GymnasiumVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all copies; copy i gets the seed s + i after ``seed(s)``, if the vector environment seeds that way."""
-        obs, _ = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        """
+        Reset all copies; copy i gets the seed s + i after ``seed(s)``, if the vector environment seeds that way.
+
+        :raises ValueError: If ``set_options`` has given the copies different options
+        """
+        if any(options != self._options[0] for options in self._options):
+            raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
+        obs, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         observations: VecEnvObs = copy(obs)
@@ -106,15 +113,21 @@ class GymnasiumVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step."""
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
-        infos = [{"TimeLimit.truncated": cut} for cut in (truncated & ~terminated).tolist()]
         dones = terminated | truncated
+        if self.restart is None and dones.any() and "final_obs" not in env_infos:
+            raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
         # A copy that has reset itself tells its last step's observation and infos apart from those of the reset
         last_obs, last_infos = env_infos.pop("final_obs", obs), env_infos.pop("final_info", env_infos)
-        distribute(env_infos, infos, ~dones)
+        for mask in ("_final_obs", "_final_info"):
+            env_infos.pop(mask, None)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if env_infos or last_infos:
+            infos = [info_of(last_infos if done else env_infos, i) for i, done in enumerate(dones)]
+        for info, is_cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
+            info["TimeLimit.truncated"] = is_cut
         if dones.any():
-            distribute(last_infos, infos, dones)
-            for i in np.flatnonzero(dones):
-                infos[i]["terminal_observation"] = copy(one_of(last_obs, int(i)))
+            for i in np.flatnonzero(dones).tolist():
+                infos[i]["terminal_observation"] = copy(one_of(last_obs, i))
             obs = obs if self.restart is None else self.restart(self.env, dones)
         return copy(obs), rewards.astype(np.float32), dones, infos
 
@@ -129,7 +142,10 @@ class GymnasiumVecEnv(VecEnv):
         :param attr_name: Its name
         :param indices: Of which copies
         """
-        if hasattr(self.env.unwrapped, "get_attr") and attr_name != "render_mode":
+        copies = getattr(self.env.unwrapped, "envs", None)
+        if copies is not None and attr_name != "render_mode":
+            values = [single.get_wrapper_attr(attr_name) for single in copies]
+        elif hasattr(self.env.unwrapped, "get_attr") and attr_name != "render_mode":
             values = self.env.unwrapped.get_attr(attr_name)
         else:
             values = [getattr(self.env, attr_name)] * self.num_envs
@@ -147,7 +163,7 @@ class GymnasiumVecEnv(VecEnv):
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"indices must be None to set {attr_name!r} in a vector environment, got {indices}")
         if hasattr(self.env.unwrapped, "set_attr"):
-            self.env.unwrapped.set_attr(attr_name, value)
+            self.env.unwrapped.set_attr(attr_name, [value] * self.num_envs)
         else:
             setattr(self.env.unwrapped, attr_name, value)
 
@@ -161,7 +177,7 @@ class GymnasiumVecEnv(VecEnv):
         :param method_args: Its arguments
         :param indices: Of which copies
         :param kwargs: Its keyword arguments
-        :raises NotImplementedError: If the vector environment has no copies in this process that could be called
+        :raises NotImplementedError: If the vector environment has no single copies that could be called
         """
         copies = getattr(self.env.unwrapped, "envs", None)
         if copies is None:
@@ -206,15 +222,16 @@ def copy(obs: Any) -> Any:
     return {key: np.array(part) for key, part in obs.items()} if isinstance(obs, dict) else np.array(obs)
 
 
-def distribute(env_infos: dict[str, Any], infos: list[dict[str, Any]], which: Bools) -> None:
+def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:
     """
-    Gymnasium's dict of arrays, in which ``_key`` masks ``key``, into a dict for each copy.
+    The info of one copy from Gymnasium's dict of arrays, in which ``_key`` masks ``key``.
 
     :param env_infos: The infos of a vector environment
-    :param infos: A dict for each copy, to add to
-    :param which: Which copies to add to, shape ``(n_envs,)``
+    :param i: Which copy
     """
+    info = {}
     for key, values in env_infos.items():
-        if not key.startswith("_"):
-            for i in np.flatnonzero(which & env_infos.get(f"_{key}", True)):
-                infos[i][key] = one_of(values, int(i))
+        is_mask = key.startswith("_") and key[1:] in env_infos
+        if not is_mask and (f"_{key}" not in env_infos or env_infos[f"_{key}"][i]):
+            info[key] = info_of(values, i) if isinstance(values, dict) else values[i]
+    return info

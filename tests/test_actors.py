@@ -5,11 +5,12 @@ import pytest
 import torch as th
 from environments import Corridor
 from gymnasium import spaces
+from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_noise, make_sampler
+from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_actor, make_noise, make_sampler
 from sb3_reinforce.layers import actor_layers
 
 SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
@@ -81,21 +82,105 @@ def test_noise_is_that_of_its_distribution():
     assert not np.array_equal(next(noise), next(noise))
 
 
-class Changed(ActorCriticPolicy):
+def scale(module, factor=-20):
+    """A hook that turns a module's preferences around."""
+    module.register_forward_hook(lambda module, inputs, output: output * factor)
+
+
+class Scaled(th.nn.Sequential):
+    def forward(self, x):
+        return super().forward(x) * -20
+
+
+class Certain(CategoricalDistribution):
+    def proba_distribution(self, action_logits):
+        return super().proba_distribution(action_logits * -20)
+
+
+class OwnLatent(ActorCriticPolicy):
+    def _get_action_dist_from_latent(self, latent_pi):
+        return super()._get_action_dist_from_latent(latent_pi * -20)
+
+
+class OwnFeatures(ActorCriticPolicy):
     def extract_features(self, obs, features_extractor=None):
-        return super().extract_features(obs, features_extractor)
+        return super().extract_features(obs, features_extractor) * -20
+
+
+class OwnLinear(th.nn.Linear):
+    def forward(self, x):
+        return super().forward(x) * -20
+
+
+def own_body(policy):
+    policy.mlp_extractor.policy_net = Scaled(*policy.mlp_extractor.policy_net)
+
+
+def own_layer(policy):
+    policy.action_net.__class__ = OwnLinear
+
+
+def own_forward(policy):
+    action_net = policy.action_net.forward
+    policy.action_net.forward = lambda x: action_net(x) * -20
+
+
+def own_method(policy):
+    method = policy._get_action_dist_from_latent
+    policy._get_action_dist_from_latent = lambda latent: method(latent * -20)
+
+
+CHANGES = {
+    "as it is": lambda policy: None,
+    "class": lambda policy: setattr(policy, "__class__", OwnLatent),
+    "features": lambda policy: setattr(policy, "__class__", OwnFeatures),
+    "method": own_method,
+    "distribution": lambda policy: setattr(policy, "action_dist", Certain(2)),
+    "hook on the head": lambda policy: scale(policy.action_net),
+    "hook on the body": lambda policy: scale(policy.mlp_extractor.policy_net),
+    "hook on a layer": lambda policy: scale(policy.mlp_extractor.policy_net[0]),
+    "hook on the extractor": lambda policy: scale(policy.features_extractor),
+    "pre-hook": lambda policy: policy.action_net.register_forward_pre_hook(lambda module, x: (x[0] * -20,)),
+    "body": own_body,
+    "layer": own_layer,
+    "forward": own_forward,
+    "no bias": lambda policy: setattr(policy.action_net, "bias", None),
+    "gelu": lambda policy: policy.mlp_extractor.policy_net.append(th.nn.GELU()),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
+    """Otherwise the gradient would be that of another policy than the one that acts."""
+    policy = make_policy(spaces.Discrete(2))
+    obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
+
+    def probability():
+        with th.no_grad():
+            return policy.evaluate_actions(obs_as_tensor(obs[:1], "cpu"), th.ones(1))[1].exp().item()
+
+    before = probability()
+    CHANGES[change](policy)
+    actor, expected = make_actor(policy, N_DRAWS, False), probability()
+    share = actor.act(obs)[0].mean()
+    assert share == pytest.approx(expected, abs=4 * 0.5 / N_DRAWS**0.5)
+    assert isinstance(actor, LaidOutActor) == (change == "as it is") and abs(before - expected) < 1
+    assert change in ("as it is", "no bias", "gelu") or abs(before - expected) > 0.2
 
 
 def test_whatever_is_not_plain_goes_the_general_way():
-    assert actor_layers(make_policy()) is not None
-    assert actor_layers(make_policy(policy=Changed)) is None
     assert actor_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
     assert actor_layers(make_policy(temperature=0.5)) is None
     assert actor_layers(make_policy(SPACES[3], use_sde=True)) is None
+    assert actor_layers(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
     assert actor_layers(th.compile(make_policy(), backend="eager")) is None
-    hooked = make_policy()
-    hooked.mlp_extractor.policy_net[0].register_forward_hook(lambda module, inputs, output: output * 0)
-    assert actor_layers(hooked) is None
+
+
+def test_a_squashed_gaussian_is_squashed():
+    policy = make_policy(spaces.Box(-1, 1, (2,)))
+    policy.action_dist = SquashedDiagGaussianDistribution(2)
+    actions = make_actor(policy, 3, False).act(10 * np.ones((3, 5), dtype=np.float32))[0]
+    assert np.abs(actions).max() < 1
 
 
 def test_each_rollout_acts_with_the_parameters_of_the_last_update():

@@ -7,9 +7,12 @@ from environments import Corridor
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.critic import fit_critic, values_of
+from sb3_reinforce.layers import critic_layers
+from sb3_reinforce.policies import evaluate
 
 N_STEPS, N_ENVS = 7, 3
 
@@ -32,7 +35,8 @@ OWN = {"MlpPolicy": OwnCritic, "CnnPolicy": OwnCnnCritic}
 
 
 def make(policy, **kwargs):
-    is_image, image = "Cnn" in str(policy), {"screen_height": 36, "screen_width": 36}
+    is_image = policy == "CnnPolicy" or (isinstance(policy, type) and issubclass(policy, ActorCriticCnnPolicy))
+    image = {"screen_height": 36, "screen_width": 36}
     env = make_vec_env(FakeImageEnv if is_image else Corridor, N_ENVS, 0, env_kwargs=image if is_image else {})
     return REINFORCE(policy, env, **{"n_steps": N_STEPS, "seed": 0, "device": "cpu", **kwargs})
 
@@ -86,3 +90,69 @@ def test_how_often_a_shared_features_extractor_is_evaluated(baseline):
     model.learn(1)
     n_steps = 10  # the length of every episode, which a time limit ends
     assert len(calls) == n_steps + 1 + (1 + 2 if baseline == "value" else 1)
+
+
+class ActionZero(ActorCriticCnnPolicy):
+    """Its own way to the actions."""
+
+    def get_distribution(self, obs):
+        logits = super().get_distribution(obs).distribution.logits
+        return self.action_dist.proba_distribution(logits + 1e3 * th.eye(logits.shape[1])[0])
+
+
+@pytest.mark.parametrize("baseline", ["value", "none"])
+def test_a_policys_own_distribution_is_used_with_a_shared_features_extractor(baseline):
+    mode = {"n_steps": 8} if baseline == "value" else {"n_steps": None, "n_episodes": N_ENVS}
+    model = make(ActionZero, baseline=baseline, **mode).learn(8)
+    assert (model.rollout_buffer.actions == 0).all()
+    np.testing.assert_allclose(model.rollout_buffer.log_probs, 0, atol=1e-6)
+
+
+def changed(name):
+    policy = make("MlpPolicy").policy
+    if name == "method":
+        policy.predict_values = lambda obs: th.full((len(obs), 1), 3.0)
+    elif name == "class":
+        policy.__class__ = OwnCritic
+    elif name == "hook":
+        policy.mlp_extractor.value_net.register_forward_hook(lambda module, inputs, output: output + 1)
+    elif name == "no bias":
+        policy.value_net.bias = None
+    return policy
+
+
+@pytest.mark.parametrize("name", ["as it is", "method", "class", "hook", "no bias"])
+def test_a_critic_that_the_user_has_changed_is_asked_itself(name):
+    policy, model = changed(name), make("MlpPolicy").learn(1)
+    with th.no_grad():
+        expected = policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
+    np.testing.assert_allclose(values_of(policy, model.rollout_buffer), expected, rtol=1e-5, atol=1e-6)
+    assert (critic_layers(policy) is not None) == (name == "as it is")
+
+
+class Dropping(FlattenExtractor):
+    """Flat observations, of which training drops half."""
+
+    def forward(self, observations):
+        return th.nn.functional.dropout(super().forward(observations), 0.5, self.training)
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_only_an_extractor_that_does_not_move_is_kept(share):
+    """Dropout draws anew for each pass of a critic's own extractor; one that the actor shares is in evaluation mode."""
+    kwargs = {"features_extractor_class": Dropping, "share_features_extractor": share}
+    model, modes = make("MlpPolicy", policy_kwargs=kwargs, n_critic_updates=3, batch_size=100), []
+    hook = lambda module, *args: modes.append(module.training)  # noqa: E731
+    model.policy.vf_features_extractor.register_forward_hook(hook)
+    model.learn(1)
+    # The last rows: three passes of the critic, or one for all of them
+    assert modes[-3:] == [True] * 3 if not share else modes[-2:] == [True, False]
+
+
+@pytest.mark.parametrize("policy", OWN)
+def test_values_of_the_policy_step_are_those_of_predict_values(policy):
+    """Also where that is the user's own, and the extractor is shared."""
+    own = type("Own", (OWN[policy],), {"predict_values": lambda self, obs: th.full((len(obs), 1), 3.0)})
+    model = make(own).learn(1)
+    obs = observations(model.rollout_buffer)
+    assert (evaluate(model.policy, obs, th.zeros(len(obs)), with_values=True)[2] == 3).all()

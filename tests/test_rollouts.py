@@ -204,13 +204,13 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature
     model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, temperature=temperature)
     calls = {"get_distribution": 0, "predict_values": 0}
     for name in calls:
-        original = getattr(model.policy, name)
+        original = getattr(ActorCriticPolicy, name)
 
         def counted(*args, name=name, original=original):
             calls[name] += 1
             return original(*args)
 
-        monkeypatch.setattr(model.policy, name, counted)
+        monkeypatch.setattr(ActorCriticPolicy, name, counted)
     _, callback = model._setup_learn(1)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, None)
     assert calls["get_distribution"] == (0 if temperature == 1 else model.rollout_buffer.size() + 1)

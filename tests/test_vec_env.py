@@ -36,7 +36,12 @@ class Dicts(gym.ObservationWrapper):
 
     def step(self, action):
         obs, reward, terminated, truncated, _ = super().step(action)
-        return obs, reward, terminated, truncated, {"height": 3.5}
+        infos = {"height": 3.5, "_own": 2, "goal": {"place": {"x": float(obs["obs"].sum()), "at": np.zeros(2)}}}
+        return obs, reward, terminated, truncated, infos | ({"last": True} if terminated else {})
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = super().reset(seed=seed, options=options)
+        return obs, {**info, "started": 1.5, **(options or {})}
 
 
 def assert_same(one, other):
@@ -68,6 +73,7 @@ def test_every_transition_is_that_of_a_dummy_vec_env(mode, truncate, wrapper):
         assert_same(obs, obs_)
         assert_same(rewards, rewards_)
         assert_same(dones, dones_)
+        assert rewards.dtype == rewards_.dtype
         for info, info_ in zip(infos, infos_, strict=True):
             assert_same(info, info_)
         n_dones += dones.sum()
@@ -113,6 +119,64 @@ def test_every_transition_of_the_native_cart_pole_is_that_of_the_single_one():
     assert min(ends.values()) > 5
 
 
+def test_seeds_and_options_are_used_once():
+    """As by a DummyVecEnv: the next reset draws on, and its infos are told."""
+    ours, theirs = (
+        synced(lambda: Dicts(Corridor((2, 3, 5))), "SameStep"),
+        DummyVecEnv([lambda: Dicts(Corridor((2, 3, 5)))] * N_ENVS),
+    )
+    lengths = []
+    for env in (ours, theirs):
+        env.seed(3)
+        env.set_options({"level": 2})
+    for _ in range(4):
+        assert_same(ours.reset(), theirs.reset())
+        assert ours.reset_infos == theirs.reset_infos
+        lengths.append(ours.get_attr("length"))
+        assert lengths[-1] == theirs.get_attr("length")
+    assert len(set(map(tuple, lengths))) > 1 and "level" not in ours.reset_infos[0]
+    ours.set_options([{"level": i} for i in range(N_ENVS)])
+    with pytest.raises(ValueError, match="set_options"):
+        ours.reset()
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_what_was_returned_stays_as_it_was(mode):
+    """Also of a vector environment that writes all its observations into one array."""
+    shared, own = (
+        GymnasiumVecEnv(SyncVectorEnv([lambda: Corridor((2, 3))] * 2, copy=is_copy, autoreset_mode=mode))
+        for is_copy in (False, True)
+    )
+    for env in (shared, own):
+        env.seed(0)
+    returned = [(shared.reset(), own.reset())]
+    for _ in range(20):
+        (obs, _, _, infos), (obs_, _, _, infos_) = shared.step(np.zeros(2, int)), own.step(np.zeros(2, int))
+        returned += [(obs, obs_)]
+        returned += [
+            (a["terminal_observation"], b["terminal_observation"])
+            for a, b in zip(infos, infos_, strict=True)
+            if "terminal_observation" in b
+        ]
+    assert len(returned) > 30
+    for one, other in returned:
+        assert_same(one, other)
+
+
+def test_an_environment_that_does_not_tell_the_last_observation_is_refused():
+    class Untold(SyncVectorEnv):
+        def step(self, actions):
+            *rest, infos = super().step(actions)
+            infos.pop("final_obs", None)
+            return *rest, infos
+
+    env = GymnasiumVecEnv(Untold([Corridor] * 2, autoreset_mode="SameStep"))
+    env.reset()
+    with pytest.raises(ValueError, match="final_obs"):
+        for _ in range(3):
+            env.step(np.zeros(2, int))
+
+
 def test_a_late_autoreset_is_refused():
     with pytest.raises(ValueError, match=r"autoreset_mode.*SAME_STEP"):
         synced(Corridor, "NextStep")
@@ -141,6 +205,8 @@ def test_attributes_and_methods_where_the_environment_can():
     assert env.get_attr("lengths") == [(3,)] * N_ENVS and env.get_attr("lengths", 1) == [(3,)]
     env.set_attr("truncate", True)
     assert env.get_attr("truncate") == [True] * N_ENVS
+    env.set_attr("lengths", (4, 7))
+    assert env.get_attr("lengths") == [(4, 7)] * N_ENVS and callable(env.get_attr("observe")[0])
     assert len(env.env_method("observe")) == N_ENVS and len(env.env_method("observe", indices=[2])) == 1
     assert env.env_is_wrapped(gym.Wrapper) == [False] * N_ENVS and env.has_attr("lengths")
     with pytest.raises(ValueError, match="indices"):
