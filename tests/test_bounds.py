@@ -42,7 +42,7 @@ def test_memory_does_not_grow_with_updates_or_episodes(kind):
     model.learn({"steps": 3200, "episodes": 2800, "search": 4000}[kind], callback)
     tracemalloc.stop()
     assert len(callback.sizes) >= 4
-    # One rollout that was kept would be some kilobytes an update; the caches of NumPy and PyTorch fill up at a hundredth
+    # A rollout that was kept would be kilobytes an update; the caches of NumPy and PyTorch fill up at a hundredth
     assert callback.sizes[-1] - callback.sizes[1] < 250 * 50 * (len(callback.sizes) - 2), callback.sizes
 
 
