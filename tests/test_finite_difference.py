@@ -352,7 +352,7 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
         (dict(delta_std=lambda progress: progress), ValueError, "delta_std .at progress 0. must be finite and > 0"),
         (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
         (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
-        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0 and <= 1e+06, got -1"),
+        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0 and <= 1e.06, got -1"),
         (dict(max_grad_norm=0), ValueError, "max_grad_norm must be finite and > 0, got 0"),
         (dict(n_top=4), ValueError, "n_top=4 needs an n_delta of at least that, got n_delta=3"),
         (dict(n_top=1, estimator="forward"), ValueError, "n_top=1 needs estimator='central'"),
