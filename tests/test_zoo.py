@@ -16,6 +16,7 @@ import rl_zoo3
 import torch as th
 import yaml
 from gymnasium.error import DependencyNotInstalled
+from matplotlib import pyplot
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 from sb3_reinforce.zoo.__main__ import main
@@ -111,6 +112,7 @@ def test_benchmark_evaluates_every_algorithm(folder: Path) -> None:
 def test_plots(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in NAMES:
         zoo("plot_train", "-a", name, "-e", "CartPole", "-f", "logs", "-w", "2")
+        assert len(pyplot.gca().lines) >= 2
     zoo("all_plots", "-a", *NAMES, "-e", "CartPole-v1", "-f", "logs", "-o", "results", "--no-million")
     table = capsys.readouterr().out
     assert all(name.upper() in table for name in NAMES)
@@ -119,9 +121,7 @@ def test_plots(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_optuna_tunes_and_its_trials_can_be_trained(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
     train(name, "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--no-optim-plots", *study)
