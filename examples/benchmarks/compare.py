@@ -176,6 +176,8 @@ def main() -> None:
     ]
     done = finished(arguments.output)
     runs = [run for run in runs if run not in done]
+    if not runs:
+        raise SystemExit(f"Nothing to do: {arguments.output} has these runs already")
     failed, start = [], time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
         results = pool.imap_unordered(functools.partial(train, arguments.final_episodes), runs)
