@@ -1,34 +1,42 @@
 """
 How fast does CnnPolicy learn from images, on a GPU or not?
 
-Random images of Atari's size (84 x 84 x 4), REINFORCE beside A2C with rollouts of equal length; the environments cost
-next to nothing, so the networks and the way of the observations to them are what is measured.
+Images of Atari's size (84 x 84 x 4), REINFORCE beside A2C with rollouts of 32 steps; the environments show prepared
+images, so the networks and the way of the observations to them are what is measured.
 
     python examples/benchmarks/images.py --device cuda --n-envs 16 64
 """
 
 import argparse
 import statistics
-import time
 import warnings
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import torch as th
+from gymnasium import spaces
+from rates import learning
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import FakeImageEnv
 
 from sb3_reinforce import REINFORCE
 
-IMAGE = {"screen_height": 84, "screen_width": 84, "n_channels": 4}
 
+class Images(gym.Env[np.ndarray, np.int64]):
+    """Shows prepared images, in episodes of 100 steps, so that it costs next to nothing."""
 
-def learning(algorithm: type, n_envs: int, timesteps: int, device: str, **kwargs: object) -> float:
-    """Steps a second of ``learn()`` with rollouts of 32 steps, after a first rollout that is not counted."""
-    env = make_vec_env(FakeImageEnv, n_envs, env_kwargs=IMAGE)
-    model = algorithm("CnnPolicy", env, n_steps=32, device=device, seed=0, **kwargs).learn(1)
-    before, start = model.num_timesteps, time.perf_counter()
-    model.learn(timesteps, reset_num_timesteps=False)
-    return (model.num_timesteps - before) / (time.perf_counter() - start)
+    observation_space, action_space = spaces.Box(0, 255, (84, 84, 4), np.uint8), spaces.Discrete(6)
+    images = np.random.default_rng(0).integers(256, size=(100, 84, 84, 4), dtype=np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self.images[0], {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.t += 1
+        return self.images[self.t % 100], float(action == self.t % 6), False, self.t == 100, {}
 
 
 def main() -> None:
@@ -41,11 +49,15 @@ def main() -> None:
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
     for n_envs in arguments.n_envs:
+        both = {"n_steps": 32, "device": arguments.device}
+        ours = {**both, "n_critic_updates": 1, "batch_size": 32 * n_envs}
         ratios = []
         for _ in range(arguments.rounds):
-            common = (n_envs, arguments.timesteps, arguments.device)
-            ours = learning(REINFORCE, *common, n_critic_updates=1, batch_size=32 * n_envs)
-            ratios.append(ours / learning(A2C, *common))
+            rates = [
+                learning(algorithm, "CnnPolicy", make_vec_env(Images, n_envs), arguments.timesteps, **kwargs)
+                for algorithm, kwargs in ((REINFORCE, ours), (A2C, both))
+            ]
+            ratios.append(rates[0] / rates[1])
         print(
             f"{n_envs} environments on {arguments.device}: REINFORCE / A2C {statistics.median(ratios):.2f}", flush=True
         )

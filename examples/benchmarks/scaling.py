@@ -1,8 +1,9 @@
 """
-How does throughput grow with the number of environments, and how far below the bare environment does it stay?
+How does throughput grow with the number of environments, and how far is it from that of the environments alone?
 
 CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorisation
-through ``GymnasiumVecEnv``, and both VecEnvs with no learner. Writes a CSV, and with matplotlib the picture.
+through ``GymnasiumVecEnv``, and the ``step`` of both VecEnvs with no learner. Writes a CSV, and with matplotlib the
+picture.
 
     python examples/benchmarks/scaling.py --output examples/benchmarks/results/scaling
 """
@@ -10,22 +11,19 @@ through ``GymnasiumVecEnv``, and both VecEnvs with no learner. Writes a CSV, and
 import argparse
 import csv
 import statistics
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import torch as th
+from rates import ONE_PASS, bare, learning
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.vec_env import GymnasiumVecEnv
-
-ONE_PASS = {"n_critic_updates": 1, "batch_size": 2048}
 
 
 def dummy(n_envs: int) -> VecEnv:
@@ -36,31 +34,20 @@ def native(n_envs: int) -> VecEnv:
     return VecMonitor(GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point")))
 
 
-def bare(env: VecEnv, timesteps: int) -> float:
-    """Steps a second of a VecEnv with prepared actions and no learner."""
-    actions = np.random.default_rng(0).integers(2, size=(64, env.num_envs))
-    env.reset()
-    start = time.perf_counter()
-    for step in range(timesteps // env.num_envs):
-        env.step(actions[step % 64])
-    return timesteps / (time.perf_counter() - start)
+def reinforce(env: VecEnv, timesteps: int) -> float:
+    return learning(REINFORCE, "MlpPolicy", env, timesteps, n_steps=max(8, 2048 // env.num_envs), **ONE_PASS)
 
 
-def learning(algorithm: type, env: VecEnv, timesteps: int, **kwargs: object) -> float:
-    """Steps a second of ``learn()`` with rollouts of 2048 steps, after a first rollout that is not counted."""
-    n_steps = max(8, 2048 // env.num_envs)
-    model = algorithm("MlpPolicy", env, n_steps=n_steps, seed=0, device="cpu", **kwargs).learn(1)
-    before, start = model.num_timesteps, time.perf_counter()
-    model.learn(timesteps, reset_num_timesteps=False)
-    return (model.num_timesteps - before) / (time.perf_counter() - start)
+def a2c(env: VecEnv, timesteps: int) -> float:
+    return learning(A2C, "MlpPolicy", env, timesteps, n_steps=max(8, 2048 // env.num_envs))
 
 
 CONTENDERS: dict[str, Callable[[int, int], float]] = {
     "native VecEnv, no learner": lambda n, steps: bare(native(n), steps),
     "DummyVecEnv, no learner": lambda n, steps: bare(dummy(n), steps),
-    "REINFORCE, native": lambda n, steps: learning(REINFORCE, native(n), steps, **ONE_PASS),
-    "REINFORCE": lambda n, steps: learning(REINFORCE, dummy(n), steps, **ONE_PASS),
-    "A2C": lambda n, steps: learning(A2C, dummy(n), steps),
+    "REINFORCE, native": lambda n, steps: reinforce(native(n), steps),
+    "REINFORCE": lambda n, steps: reinforce(dummy(n), steps),
+    "A2C": lambda n, steps: a2c(dummy(n), steps),
 }
 
 

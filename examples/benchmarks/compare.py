@@ -1,0 +1,203 @@
+"""
+How do REINFORCE and FiniteDifference compare with A2C, PPO and ARS: by steps, by seconds, and at the end?
+
+    python examples/benchmarks/compare.py --tasks CartPole-v1 LunarLander-v3 --seeds 0 1 2 3 4 --output results.csv
+
+All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the settings that the
+RL Zoo publishes (those of another version of the task where it has none for this one), ours those of
+``sb3_reinforce.zoo``; the two searches are run only on tasks that they have settings for.
+
+The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
+the budget, and at the end on ``--final-episodes``. ``steps`` are counted by the environments, since ARS counts some of
+its more than once; ``seconds`` are those of training, without the evaluations, and ``cpu_seconds`` the same as the
+process's own clock counts them, which a busy machine does not stretch. The rows of a run are written when it is
+finished, and runs that are there already are not repeated: stop the script when you like and start it again.
+"""
+
+import argparse
+import contextlib
+import csv
+import functools
+import io
+import multiprocessing
+import re
+import signal
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import rl_zoo3
+import torch as th
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_reinforce.zoo import HYPERPARAMS
+
+ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "ars")
+SEARCHES = ("finite_difference", "ars")
+BUDGETS = {
+    "CartPole-v1": 100_000, "Acrobot-v1": 500_000, "MountainCarContinuous-v0": 100_000, "Pendulum-v1": 500_000,
+}  # fmt: skip
+OTHER_BUDGET = 1_000_000
+N_EVALUATIONS = 20
+EVALUATION_EPISODES = 10
+N_EVAL_ENVS = 10
+COLUMNS = (
+    "task", "algorithm", "seed", "budget", "evaluation", "steps", "seconds", "cpu_seconds", "return", "return_std",
+    "episodes",
+)  # fmt: skip
+
+
+class Run(NamedTuple):
+    """One training, named by the first columns of its rows."""
+
+    task: str
+    algorithm: str
+    seed: int
+    budget: int
+
+
+def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
+    """The settings published for a task, its latest other version, or any task; None where a search has none."""
+    ours = HYPERPARAMS / f"{algorithm}.yml"
+    path = ours if ours.exists() else Path(rl_zoo3.__file__).parent / "hyperparams" / ours.name
+    published = yaml.safe_load(path.read_text())
+    if task in published:
+        return published[task]
+    versions = [int(key.split("-v")[1]) for key in published if re.fullmatch(rf"{task.split('-v')[0]}-v\d+", key)]
+    if versions:
+        return published[f"{task.split('-v')[0]}-v{max(versions)}"]
+    return None if algorithm in SEARCHES else published["default"]
+
+
+def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
+    """A model, its environments and those of its evaluations, with a configuration that no other run shares."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        manager = ExperimentManager(
+            argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
+        )
+        kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(
+            dict(settings_of(run.algorithm, run.task))
+        )
+        env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
+        # The same starts for all algorithms, other than those of the training
+        manager.seed = 10_000 + run.seed
+        eval_env = manager.create_envs(N_EVAL_ENVS, eval_env=True)
+    return rl_zoo3.ALGOS[run.algorithm](env=env, seed=run.seed, device="cpu", **kwargs), env, eval_env
+
+
+def clocks() -> np.ndarray:
+    """The time of the day and that of this process, in seconds."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+class Evaluations(BaseCallback):
+    """Evaluates between rollouts, where each algorithm holds the policy it has found, and stops the clock meanwhile."""
+
+    def __init__(self, run: Run, env: VecEnv, eval_env: VecEnv):
+        super().__init__()
+        self.run, self.env, self.eval_env = run, env, eval_env
+        self.rows: list[dict[str, Any]] = []
+        self.twentieth = 0
+        self.spent, self.since = np.zeros(2), clocks()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        twentieth = sum(self.env.get_attr("total_steps")) * N_EVALUATIONS // self.run.budget
+        if twentieth >= self.twentieth:
+            self.evaluate("training", EVALUATION_EPISODES)
+            self.twentieth = twentieth + 1
+
+    def evaluate(self, evaluation: str, episodes: int) -> None:
+        self.spent += clocks() - self.since
+        steps = sum(self.env.get_attr("total_steps"))
+        sync_envs_normalization(self.env, self.eval_env)
+        mean, std = evaluate_policy(self.model, self.eval_env, episodes)
+        row = (*self.run, evaluation, steps, *self.spent.round(2), round(mean, 3), round(std, 3), episodes)
+        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
+        self.since = clocks()
+
+
+def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Exception]:
+    """
+    Train one model.
+
+    :param final_episodes: Episodes of the last evaluation
+    :param run: Which model
+    :return: The run, and one row per evaluation or the error that ended it
+    """
+    th.set_num_threads(1)
+    warnings.filterwarnings("ignore")
+    # Ctrl-C is the main process's to answer
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        model, env, eval_env = make(run)
+        evaluations = Evaluations(run, env, eval_env)
+        model.learn(run.budget, evaluations, log_interval=None)
+        evaluations.evaluate("final", final_episodes)
+    except Exception as error:
+        return run, error
+    return run, evaluations.rows
+
+
+def finished(path: Path) -> set[Run]:
+    """The runs that a CSV has the last row of."""
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["evaluation"] == "final"]
+    return {Run(row["task"], row["algorithm"], int(row["seed"]), int(row["budget"])) for row in rows}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", required=True)
+    parser.add_argument("--algorithms", nargs="+", default=ALGORITHMS, choices=list(rl_zoo3.ALGOS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--timesteps", type=int, help="steps per run; the default depends on the task")
+    parser.add_argument("--final-episodes", type=int, default=100)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--output", type=Path, required=True, help="the CSV; rows are added to it")
+    arguments = parser.parse_args()
+    if not arguments.output.exists():
+        arguments.output.write_text(",".join(COLUMNS) + "\n")
+    runs = [
+        Run(task, algorithm, seed, arguments.timesteps or BUDGETS.get(task, OTHER_BUDGET))
+        for seed in arguments.seeds
+        for task in arguments.tasks
+        for algorithm in arguments.algorithms
+        if settings_of(algorithm, task) is not None
+    ]
+    done = finished(arguments.output)
+    runs = [run for run in runs if run not in done]
+    if not runs:
+        raise SystemExit(f"Nothing to do: {arguments.output} has these runs already")
+    failed, start = [], time.perf_counter()
+    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
+        results = pool.imap_unordered(functools.partial(train, arguments.final_episodes), runs)
+        for number, (run, outcome) in enumerate(results, 1):
+            minutes = (time.perf_counter() - start) / 60
+            left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"
+            name = f"{run.task} {run.algorithm} seed {run.seed}"
+            if isinstance(outcome, Exception):
+                failed.append(f"{name}: {outcome!r}")
+                print(left, failed[-1], flush=True)
+                continue
+            text = io.StringIO()
+            csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(outcome)
+            with arguments.output.open("a") as file:
+                file.write(text.getvalue())
+            last = outcome[-1]
+            print(left, f"{name}: {last['return']:.1f}, {last['steps']} steps, {last['seconds']:.0f} s", flush=True)
+    if failed:
+        raise SystemExit("Failed:\n" + "\n".join(failed))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""
+What a comparison shows: tables, and pictures by rliable (intervals are 95 % of a stratified bootstrap).
+
+    python examples/benchmarks/compare_plots.py results.csv --output results
+
+Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds, a row per task) and
+results_summary.png (interquartile mean, performance profiles and probability of improvement over all tasks), and prints
+the final evaluations as a Markdown table. In the summary 0 is a random policy and 1 the Zoo's published PPO; it has the
+algorithms that were run on every task.
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from rliable import library, metrics
+from scipy.stats import trim_mean
+
+REPETITIONS = 2000
+LABELS = {
+    "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
+}  # fmt: skip
+# Mean return of uniformly random actions (100 episodes), and of PPO in the Zoo's benchmark.md, whose versions of
+# LunarLander and MuJoCo's tasks are older
+REFERENCES = {
+    "CartPole-v1": (23.7, 500.0),
+    "Acrobot-v1": (-497.1, -73.5),
+    "MountainCar-v0": (-200.0, -110.4),
+    "MountainCarContinuous-v0": (-33.3, 88.3),
+    "Pendulum-v1": (-1207.6, -172.2),
+    "LunarLander-v3": (-192.0, 242.1),
+    "LunarLanderContinuous-v3": (-212.7, 270.9),
+    "BipedalWalker-v3": (-106.3, 287.9),
+    "HalfCheetah-v5": (-282.5, 5819.0),
+    "Hopper-v5": (16.7, 2410.0),
+    "Walker2d-v5": (1.8, 3479.0),
+    "Swimmer-v5": (0.8, 282.0),
+    "Ant-v5": (-48.0, 1327.0),
+}
+
+
+def curve(runs: pd.DataFrame, column: str, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The interquartile mean of runs and its interval, on 50 points from 0 to ``end`` of a column."""
+    points = np.linspace(0, end, 50)
+    scores = np.array([np.interp(points, run[column], run["return"]) for _, run in runs.groupby("seed")])
+    iqm, interval = library.get_interval_estimates({"": scores[:, None]}, iqm_of_points, reps=REPETITIONS)
+    return points, iqm[""], interval[""]
+
+
+def iqm_of_points(scores: np.ndarray) -> np.ndarray:
+    """The interquartile mean at each point, of scores of shape ``(n_runs, n_tasks, n_points)``, in one call."""
+    return trim_mean(scores.reshape(-1, scores.shape[-1]), proportiontocut=0.25, axis=0)
+
+
+def draw_curves(results: pd.DataFrame, clock: str) -> None:
+    tasks = list(results.groupby(["task", "budget"], sort=False))
+    _, rows = plt.subplots(len(tasks), 2, figsize=(9, 2.6 * len(tasks)), layout="constrained", squeeze=False)
+    for axes, ((task, budget), runs) in zip(rows, tasks, strict=True):
+        for algorithm, mine in runs.groupby("algorithm", sort=False):
+            seconds = mine[mine["evaluation"] == "final"][clock].median()
+            for axis, column, end in zip(axes, ("steps", clock), (budget, seconds), strict=True):
+                points, iqm, (low, high) = curve(mine, column, end)
+                axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
+                axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
+        axes[0].set(title=task, xlabel="steps", ylabel="return")
+        axes[1].set(title=task, xlabel="seconds of training", xscale="symlog")
+    rows[0, 0].legend(frameon=False, fontsize="small")
+
+
+def color(algorithm: str) -> str:
+    return f"C{list(LABELS).index(algorithm)}" if algorithm in LABELS else "black"
+
+
+def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Normalized final returns of each algorithm that was run on every task, shape ``(n_runs, n_tasks)``."""
+    final = results[results["evaluation"] == "final"].copy()
+    unknown = set(final["task"]) - REFERENCES.keys()
+    if unknown:
+        raise ValueError(f"REFERENCES has no random and no good return of {', '.join(sorted(unknown))}: add them")
+    low, high = np.array([REFERENCES[task] for task in final["task"]]).T
+    final["return"] = (final["return"] - low) / (high - low)
+    table = final.pivot_table(index=["algorithm", "seed"], columns=["task", "budget"], values="return", sort=False)
+    return {name: runs.to_numpy() for name, runs in table.dropna().groupby("algorithm", sort=False)}
+
+
+def draw_summary(scores: dict[str, np.ndarray]) -> None:
+    _, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    means, intervals = library.get_interval_estimates(scores, metrics.aggregate_iqm, reps=REPETITIONS)
+    draw_intervals(left, means, intervals)
+    left.set(xlabel="normalized return, interquartile mean")
+    thresholds = np.linspace(0, 1.2, 61)
+    profiles, bands = library.create_performance_profile(scores, thresholds, reps=REPETITIONS)
+    for name, profile in profiles.items():
+        middle.plot(thresholds, profile, color=color(name), label=LABELS.get(name, name))
+        middle.fill_between(thresholds, *bands[name], color=color(name), alpha=0.2, linewidth=0)
+    middle.set(xlabel="normalized return τ", ylabel="share of runs above τ")
+    middle.legend(frameon=False, fontsize="small")
+    others = {name: (scores["reinforce"], score) for name, score in scores.items() if name != "reinforce"}
+    if others:
+        chances, spans = library.get_interval_estimates(others, metrics.probability_of_improvement, reps=REPETITIONS)
+        draw_intervals(right, chances, spans)
+        right.axvline(0.5, color="grey", linestyle=":")
+        right.set(xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
+
+
+def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[str, np.ndarray]) -> None:
+    for row, (name, value) in enumerate(values.items()):
+        low, high = np.ravel(intervals[name])
+        axis.barh(row, high - low, left=low, height=0.5, color=color(name), alpha=0.5)
+        axis.plot(2 * [float(value)], [row - 0.25, row + 0.25], color="black")
+    axis.set_yticks(range(len(values)), [LABELS.get(name, name) for name in values])
+    axis.invert_yaxis()
+
+
+def table(results: pd.DataFrame, clock: str) -> str:
+    """The final evaluations: median over the seeds, least and greatest, and the median of the seconds."""
+    lines = [
+        "| task (steps) | algorithm | seeds | return: median (least, greatest) | seconds |",
+        "|---|---|---|---|---|",
+    ]
+    final = results[results["evaluation"] == "final"]
+    for (task, budget, algorithm), runs in final.groupby(["task", "budget", "algorithm"], sort=False):
+        returns = runs["return"]
+        lines.append(
+            f"| {task} ({budget:,}) | {LABELS.get(algorithm, algorithm)} | {len(runs)} | "
+            f"{returns.median():.1f} ({returns.min():.1f}, {returns.max():.1f}) | {runs[clock].median():.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path, nargs="+", help="CSVs that compare.py has written")
+    parser.add_argument("--output", type=Path, required=True, help="path of the pictures, without suffix")
+    parser.add_argument("--clock", default="seconds", choices=["seconds", "cpu_seconds"])
+    arguments = parser.parse_args()
+    matplotlib.use("agg")
+    results = pd.concat(pd.read_csv(path) for path in arguments.results)
+    order = [*LABELS, *sorted(set(results["algorithm"]) - LABELS.keys())]
+    results = results.sort_values(
+        ["task", "budget", "algorithm"],
+        key=lambda column: column.map(order.index) if column.name == "algorithm" else column,
+        kind="stable",
+    )
+    print(table(results, arguments.clock))
+    draw_curves(results, arguments.clock)
+    plt.savefig(arguments.output.with_name(f"{arguments.output.name}_curves.png"), dpi=120)
+    draw_summary(final_scores(results))
+    plt.savefig(arguments.output.with_name(f"{arguments.output.name}_summary.png"), dpi=120)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""
+What Optuna tries: a sampler for each algorithm, and what turns the values of a trial into arguments.
+
+A trial stores what was suggested, such as a power of two; ``train --trial-id`` converts it again.
+"""
+
+from typing import Any
+
+import optuna
+from rl_zoo3.hyperparams_opt import convert_onpolicy_params
+
+
+def sample_reinforce(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Settings of REINFORCE with a critic and fixed rollouts. ``policy_kwargs`` replaces that of the configuration.
+
+    :param trial: The trial
+    :param n_actions: Dimension of the actions, not used
+    :param n_envs: Environments, which the rollout and its minibatches are measured against
+    :param additional_args: For replay buffers, not used
+    :return: Arguments of REINFORCE
+    """
+    return convert_reinforce(
+        {
+            "n_steps_pow": trial.suggest_int("n_steps_pow", 3, 9),
+            "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 9),
+            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.1, log=True),
+            "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
+            "n_critic_updates": trial.suggest_int("n_critic_updates", 1, 20, log=True),
+            "ent_coef": trial.suggest_float("ent_coef", 1e-8, 0.1, log=True),
+            "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 2.0),
+            "net_arch": trial.suggest_categorical("net_arch", ["tiny", "small", "medium"]),
+            "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
+        }
+    )
+
+
+def convert_reinforce(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: What ``sample_reinforce`` has suggested
+    :return: Arguments of REINFORCE
+    """
+    arguments: dict[str, Any] = convert_onpolicy_params(sampled_params)
+    return arguments
+
+
+def sample_finite_difference(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Settings of FiniteDifference, for the policy of the configuration.
+
+    :param trial: The trial
+    :param n_actions: Dimension of the actions, not used
+    :param n_envs: Environments, not used
+    :param additional_args: For replay buffers, not used
+    :return: Arguments of FiniteDifference
+    """
+    return convert_finite_difference(
+        {
+            "estimator": trial.suggest_categorical("estimator", ["central", "forward", "regression"]),
+            "n_delta_pow": trial.suggest_int("n_delta_pow", 1, 6),
+            "top_fraction": trial.suggest_float("top_fraction", 0.1, 1.0),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-3, 0.3, log=True),
+            "delta_std": trial.suggest_float("delta_std", 0.01, 0.3, log=True),
+            "n_eval_episodes": trial.suggest_int("n_eval_episodes", 1, 4),
+        }
+    )
+
+
+def convert_finite_difference(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: What ``sample_finite_difference`` has suggested
+    :return: Arguments of FiniteDifference
+    """
+    arguments = dict(sampled_params)
+    arguments["n_delta"] = 2 ** arguments.pop("n_delta_pow")
+    best = max(1, round(arguments.pop("top_fraction") * arguments["n_delta"]))
+    # Always given, since the configuration may hold one that does not go with what was sampled
+    arguments["n_top"] = best if arguments["estimator"] == "central" else None
+    return arguments
