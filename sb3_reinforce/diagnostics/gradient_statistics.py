@@ -68,19 +68,21 @@ def gram(gradients: th.Tensor) -> th.Tensor:
 
 def moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
     """
-    ``E‖g‖² ≈ Σ_i c_i K_ii / Σ_i c_i`` and ``‖E g‖² ≈ Σ_{i≠j} c_i c_j K_ij / Σ_{i≠j} c_i c_j``.
+    ``E‖g‖² ≈ Σ_{i≠j} c_i c_j K_ii / Σ_{i≠j} c_i c_j`` and ``‖E g‖² ≈ Σ_{i≠j} c_i c_j K_ij / Σ_{i≠j} c_i c_j``.
 
-    Both are unbiased for counts of 1. The second leaves out the pairs of a sample with itself, and of a resample with
-    its own copies, which would count noise as signal (a U-statistic: Hoeffding, 1948).
+    Both are unbiased for counts of 1. They leave out the pairs of a sample with itself, and of a resample with its own
+    copies, which would count noise as signal (a U-statistic: Hoeffding, 1948). Over the same pairs, their difference is
+    half the mean of ``‖g_i − g_j‖²`` in every resample, and so never negative.
 
     :param gram: ``K_ij = ⟨g_i, g_j⟩``, shape ``(m, m)``
     :param counts: How often each sample is in each resample, shape ``(r, m)``
     :return: Moments of shape ``(r,)``
     """
-    diagonal = gram.diagonal()
-    second = counts @ diagonal / counts.sum(1)
-    pairs = ((counts @ gram) * counts).sum(1) - counts.square() @ diagonal
-    return Moments(second, pairs / (counts.sum(1).square() - counts.square().sum(1)))
+    diagonal, total = gram.diagonal(), counts.sum(1)
+    n_pairs = total.square() - counts.square().sum(1)
+    second = (counts * (total[:, None] - counts)) @ diagonal
+    signal = ((counts @ gram) * counts).sum(1) - counts.square() @ diagonal
+    return Moments(second / n_pairs, signal / n_pairs)
 
 
 def variance(of: Moments) -> th.Tensor:
@@ -89,7 +91,8 @@ def variance(of: Moments) -> th.Tensor:
 
     :param of: Moments
     """
-    return of.second - of.signal
+    # Of samples that are all alike, rounding can leave a difference below 0
+    return (of.second - of.signal).clamp(min=0)
 
 
 def signal_to_noise(of: Moments) -> th.Tensor:
