@@ -2,12 +2,14 @@
 
 from itertools import product
 
+import numpy as np
 import pytest
 import torch as th
 from environments import Tree
 from test_enumeration import LOGITS, episode_terms, log_pi
 
 from sb3_reinforce.diagnostics.bootstrap import interval, resamples
+from sb3_reinforce.diagnostics.estimator_comparison import estimator_row
 from sb3_reinforce.diagnostics.gradient_statistics import (
     Moments,
     gradient_statistics,
@@ -16,6 +18,7 @@ from sb3_reinforce.diagnostics.gradient_statistics import (
     signal_to_noise,
     variance,
 )
+from sb3_reinforce.diagnostics.tables import as_text
 
 MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
 FACTOR = th.randn(8, 8, dtype=th.float64, generator=th.Generator().manual_seed(3))
@@ -94,6 +97,42 @@ def test_95_percent_intervals_cover_the_truth_in_90_to_98_percent_of_500_repetit
         estimates = [found.variance, found.snr, found.noise_scale, found.cosine]
         covered += th.tensor([e.low <= t <= e.high for e, t in zip(estimates, truth, strict=True)]).float()
     assert ((0.90 <= covered / 500) & (covered / 500 <= 0.98)).all(), covered / 500
+
+
+@pytest.mark.parametrize(("m", "scale"), [(10, 0.2), (32, 0.2), (10, 0.5), (20, 1.0)])
+def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same(m, scale):
+    """Signal-to-noise ratios of the mean from 0.08 to 4; the reference is as noisy where it is made of samples too."""
+    generator, covered, both = th.Generator().manual_seed(0), 0, 0
+    reference = th.ones(8, dtype=th.float64) + MEAN
+    truth = float(MEAN @ reference / MEAN.norm() / reference.norm())
+    shift = (scale - 1) * MEAN
+    for seed in range(500):
+        gradients, others = draw(m, generator) + shift, draw(m, generator) + shift + scale * th.ones(8)
+        found = gradient_statistics(gradients, reference, n_resamples=200, seed=seed).cosine
+        covered += found.low <= truth <= found.high
+        counts, other_counts = resamples(m, 200, seed), resamples(m, 200, seed + 1000)
+        found = estimator_row("", gradients, others, 1, 1, counts, other_counts, 0.95).cosine
+        both += found.low <= truth <= found.high
+    assert min(covered, both) >= 450, (covered, both)
+
+
+def test_without_a_signal_the_cosine_is_not_known():
+    gradients, reference = th.tensor([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]), th.tensor([1.0, 0.0])
+    found = gradient_statistics(gradients, reference).cosine
+    assert found.value != found.value
+    assert (found.low, found.high) == (-1, 1)
+    assert as_text(found) == "-"
+
+
+def test_the_noise_of_the_reference_does_not_lower_the_cosine():
+    """With the norm of the mean of 40 noisy samples it would be too small by a factor near √(1 / 1.13) = 0.94."""
+    generator, shift = th.Generator().manual_seed(2), th.tensor([1.0, 1, 1, 1, 0, 0, 0, 0], dtype=th.float64)
+    truth = float(MEAN @ (MEAN + shift) / MEAN.norm() / (MEAN + shift).norm())
+    counts, values = (resamples(400, 1, 0), resamples(40, 1, 0)), []
+    for _ in range(400):
+        gradients, reference = draw(400, generator), draw(40, generator) + shift
+        values.append(estimator_row("", gradients, reference, 1, 1, *counts, 0.95).cosine.value)
+    assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
 
 
 def test_many_samples_give_the_closed_forms():

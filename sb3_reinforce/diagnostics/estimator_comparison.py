@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce import baselines
 from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
+from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.gradient_statistics import cosine, gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import sampled
@@ -36,7 +36,7 @@ class EstimatorRow:
     One estimator of the gradient of ``U(θ) = E[Σ_t r_t]``.
 
     :param estimator: Its name
-    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient of other episodes
+    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient, whose noise is in the interval too
     :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, by the environment steps behind it
     :param steps: Environment steps behind one estimate, of all environments
     :param seconds: Time behind one estimate
@@ -110,6 +110,7 @@ def compare_estimators(
         return estimate
 
     reference = likelihood_ratio(model, n_episodes)[0]
+    reference_counts = resamples(n_episodes, n_resamples, seed + 1)
     rows = []
     for name in names:
         begin = time.perf_counter()
@@ -117,10 +118,11 @@ def compare_estimators(
             gradients, n_steps = likelihood_ratio(model, n_episodes)
         else:
             estimate = difference(name)
-            found, steps = zip(*(estimate() for _ in range(n_estimates)), strict=True)
-            gradients, n_steps = th.stack(found), sum(steps)
+            found, made = zip(*(estimate() for _ in range(n_estimates)), strict=True)
+            gradients, n_steps = th.stack(found), sum(made)
         seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
-        rows.append(estimator_row(name, gradients, reference, n_steps / len(gradients), seconds, counts, confidence))
+        steps = n_steps / len(gradients)
+        rows.append(estimator_row(name, gradients, reference, steps, seconds, counts, reference_counts, confidence))
     return Table(f"Gradient of U(θ) for {len(utility.theta)} parameters by estimator", rows)
 
 
@@ -131,6 +133,7 @@ def estimator_row(
     steps: float,
     seconds: float,
     counts: th.Tensor,
+    reference_counts: th.Tensor,
     confidence: float,
 ) -> EstimatorRow:
     """
@@ -142,16 +145,15 @@ def estimator_row(
     :param steps: Environment steps behind one estimate
     :param seconds: Time behind all estimates
     :param counts: Resamples of the estimates, shape ``(r, m)``
+    :param reference_counts: Resamples of the reference, shape ``(r, m')``
     :param confidence: Probability that an interval is to cover the truth
     """
-    found = moments(gram(gradients), counts)
+    found, of_reference = moments(gram(gradients), counts), moments(gram(reference), reference_counts)
+    products = (counts @ (gradients @ reference.T) * reference_counts).sum(1) / (
+        counts.sum(1) * reference_counts.sum(1)
+    )
+    to_reference = cosine(found, of_reference, products, confidence)
     ratio = interval(signal_to_noise(found) / steps, confidence)
-    to_reference = UNKNOWN
-    # The norm of the reference without its noise, which would make every cosine too small
-    squared = float(moments(gram(reference), th.ones(1, len(reference), dtype=th.float64)).signal)
-    if squared > 0:
-        products = counts @ (gradients @ reference.mean(0)) / counts.sum(1) / squared**0.5
-        to_reference = interval(cosine(found, products), confidence)
     return EstimatorRow(name, to_reference, ratio, steps, seconds / len(gradients))
 
 

@@ -142,17 +142,25 @@ def check_gradients(gradients: th.Tensor) -> th.Tensor:
     return gradients.detach().cpu().double()
 
 
-def cosine(of: Moments, products: th.Tensor) -> th.Tensor:
+def cosine(of: Moments, reference: Moments, products: th.Tensor, confidence: float) -> Estimate:
     """
-    ``cos = ⟨E g, r⟩ / (‖E g‖ ‖r‖)`` to a reference r, and 0 where no signal is seen.
+    ``cos = ⟨E g, E r⟩ / (‖E g‖ ‖E r‖)``, NaN where no signal is seen.
 
-    Consistent for the true gradient: with the norm of the mean of the samples in the denominator, their noise would
-    make it too small, by about ``√(1 + B / m)`` at the noise scale B.
+    Consistent for the true gradients: with the norm of the mean of the samples in the denominator, their noise would
+    make it too small, by about ``√(1 + B / m)`` at the noise scale B. Where ``‖E g‖²`` or ``‖E r‖²`` may as well be 0,
+    by its own interval, nothing is known of the direction, and the interval is [−1, 1].
 
-    :param of: Moments of g
-    :param products: ``⟨E g, r⟩ / ‖r‖``, of the same shape
+    :param of: Moments of g, of the sample and of its resamples, shape ``(1 + r,)``
+    :param reference: Moments of r, of the same shape
+    :param products: ``⟨E g, E r⟩``, of the same shape
+    :param confidence: Probability that the interval is to cover the truth
     """
-    return th.where(of.signal > 0, products / of.signal.clamp(min=1e-300).sqrt(), 0.0).clamp(-1, 1)
+    squares = of.signal.clamp(min=0) * reference.signal.clamp(min=0)
+    found = interval((products / squares.sqrt()).clamp(-1, 1), confidence)
+    value = found.value if squares[0] > 0 else float("nan")
+    if min(interval(side.signal, confidence).low for side in (of, reference)) > 0:
+        return Estimate(value, found.low, found.high)
+    return Estimate(value, -1.0, 1.0)
 
 
 def gradient_statistics(
@@ -165,8 +173,9 @@ def gradient_statistics(
     """
     Mean, variance, signal-to-noise ratio and noise scale of sampled gradients, with bootstrap intervals.
 
-    Where there is next to no signal (SNR of the mean below about 1), the intervals of SNR, noise scale and cosine are
-    wider than they need be.
+    The intervals are percentiles, and too narrow for few samples: that of the variance covers it in 86 % of the cases
+    with 5 Gaussian samples and in 90 % with 10, instead of 95 %; from about 20 on it holds. Where there is next to no
+    signal (SNR of the mean below about 1), those of SNR and noise scale are wider than they need be.
 
     :param gradients: m independent samples of the gradient, shape ``(m, n)``
     :param reference: A gradient to compare the mean with, shape ``(n,)``
@@ -187,9 +196,10 @@ def gradient_statistics(
                 f"reference must be a nonzero gradient of shape (n,) = {tuple(gradients.shape[1:])}, got shape "
                 f"{tuple(reference.shape)} and norm {float(reference.norm())}"
             )
-        direction = reference.detach().cpu().double() / reference.norm().cpu()
-        products = counts @ (gradients @ direction) / counts.sum(1)
-        to_reference = interval(cosine(found, products), confidence)
+        known = reference.detach().cpu().double()
+        square = (known @ known).expand(len(counts))
+        products = counts @ (gradients @ known) / counts.sum(1)
+        to_reference = cosine(found, Moments(square, square), products, confidence)
     return GradientStatistics(
         mean=gradients.mean(0),
         variance=interval(variance(found), confidence),
