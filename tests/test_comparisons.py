@@ -7,15 +7,25 @@ import numpy as np
 import pytest
 import torch as th
 from environments import Corridor, Tree
+from gymnasium import spaces
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.baselines import BASELINES
-from sb3_reinforce.diagnostics import compare_baselines, gradient_statistics, gradients_by_episode, sample
+from sb3_reinforce.diagnostics import (
+    GradientQualityCallback,
+    compare_baselines,
+    compare_estimators,
+    gradient_statistics,
+    gradients_by_episode,
+    sample,
+)
 from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals
 from sb3_reinforce.scores import episode_gradients
+
+BOX = spaces.Box(-1, 1, (1,))
 
 
 class GaussianBandit(Corridor):
@@ -243,6 +253,25 @@ def test_other_models_are_refused():
     model.env = None
     with pytest.raises(ValueError, match="set_env"):
         compare_baselines(model)
+
+
+def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
+    model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, device="cpu")
+    for measure in (compare_baselines, compare_estimators, lambda m: m.learn(64, GradientQualityCallback(1))):
+        with pytest.raises(ValueError, match="use_sde=True and sde_sample_freq=-1"):
+            measure(model)
+
+
+def test_with_new_noise_at_each_step_they_are():
+    """The mean of 20 episodes varies over repetitions as their own variance says, tr Σ / 20."""
+    model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, sde_sample_freq=1, device="cpu", seed=0)
+    table = compare_baselines(model, 400, ["none"], n_resamples=10)
+    means = []
+    for _ in range(60):
+        rollout = sample(model, 20)
+        means.append(gradients_by_episode(rollout, rollout.returns)[0].double().mean(0))
+    between = gradient_statistics(th.stack(means), confidence=0.999).variance
+    assert between.low < table["none"].variance.value / 20 < between.high
 
 
 def test_gradients_by_episode_is_public():

@@ -11,7 +11,7 @@ from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.diagnostics.baseline_gradients import grams
 from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
 from sb3_reinforce.diagnostics.gradient_statistics import moments, signal_to_noise, variance
-from sb3_reinforce.diagnostics.sampling import check_model, sample
+from sb3_reinforce.diagnostics.sampling import check_independent, check_model, sample
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
@@ -70,10 +70,11 @@ def compare_baselines(
     :param seed: Seed of the resamples
     :return: A table with a ``BaselineRow`` each
     :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
-    :raises ValueError: If there are too few episodes, a name is unknown, ``"value"`` has no critic, or the reference is
-        not among the baselines
+    :raises ValueError: If there are too few episodes, a name is unknown, ``"value"`` has no critic, the reference is
+        not among the baselines, or episodes are not independent because they share the noise of gSDE
     """
     check_model(model)
+    check_independent(model)
     functions, n_episodes = functions_of(model, baselines), check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
     check_number("confidence", confidence, 0, 1)

@@ -16,7 +16,7 @@ from sb3_reinforce.arguments import check_choice, check_function, check_integer,
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.gradient_statistics import cosine, gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
-from sb3_reinforce.diagnostics.sampling import sampled
+from sb3_reinforce.diagnostics.sampling import check_independent, sampled
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.finite_difference import FiniteDifference
@@ -81,10 +81,12 @@ def compare_estimators(
     :param confidence: Probability that an interval is to cover the truth
     :param seed: Seed of perturbations, episodes and resamples
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
-    :raises ValueError: If an argument is out of its range, a name is unknown, or the model has no environment
+    :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
+        episodes are not independent because they share the noise of gSDE
     """
     if not isinstance(model, REINFORCE | FiniteDifference):
         raise TypeError(f"model must be a REINFORCE or FiniteDifference, got {model!r} of type {type(model).__name__}")
+    check_independent(model)
     names = tuple(estimators)
     for name in names:
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))

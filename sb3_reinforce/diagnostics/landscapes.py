@@ -15,7 +15,7 @@ from sb3_reinforce import parameters
 from sb3_reinforce.arguments import check_integer, check_number
 from sb3_reinforce.candidate_actors import make_actor
 from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.diagnostics.sampling import undisturbed
+from sb3_reinforce.diagnostics.sampling import check_env, undisturbed
 
 
 class CandidateUtility:
@@ -35,15 +35,14 @@ class CandidateUtility:
     def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
         if not isinstance(getattr(model, "policy", None), ActorCriticPolicy):
             raise TypeError(f"model must have an actor-critic policy, got {model!r} of type {type(model).__name__}")
-        if model.env is None:
-            raise ValueError("model must have an environment to sample episodes from: call set_env first")
+        n_envs = check_env(model).num_envs
         self.model, self.n_episodes = model, check_integer("n_episodes", n_episodes, 1)
         self.seed, self.n_steps = check_integer("seed", seed, 0), 0
         policy = cast(ActorCriticPolicy, model.policy)
         policy.set_training_mode(False)
         self.parameters = parameters.actor_parameters(policy)
         self.theta = parameters.read(self.parameters)
-        self.actor = make_actor(policy, self.parameters, model.env.num_envs, deterministic=False)
+        self.actor = make_actor(policy, self.parameters, n_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:
         """

@@ -12,7 +12,7 @@ from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import by_step
 from sb3_reinforce.diagnostics.comparisons import functions_of
 from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
-from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.diagnostics.sampling import check_independent, check_model
 from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
@@ -41,7 +41,8 @@ class GradientQualityCallback(BaseCallback):
     :param max_episodes: Episodes of a rollout that are looked at
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is not a REINFORCE
-    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic
+    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic, or
+        if the model's episodes are not independent because they share the noise of gSDE
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class GradientQualityCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         check_model(self.model)
+        check_independent(self.model)
         self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
 
     def _on_step(self) -> bool:

@@ -39,6 +39,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     The model keeps its parameters, counters and log, and the statistics of a VecNormalize stay as they are; its
     environments are left at the start of an episode.
 
+    With gSDE the episodes share noise, unless ``sde_sample_freq=1``, and are not independent samples.
+
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: The baseline to collect with; None for ``"value"`` where the model has a critic, else ``"none"``
@@ -113,6 +115,32 @@ def check_model(model: Any) -> VecEnv:
     """
     if not isinstance(model, REINFORCE):
         raise TypeError(f"model must be a REINFORCE, got {model!r} of type {type(model).__name__}")
+    return check_env(model)
+
+
+def check_env(model: BaseAlgorithm) -> VecEnv:
+    """
+    Check that a model has environments.
+
+    :param model: The model
+    :return: Its environments
+    :raises ValueError: If it has none
+    """
     if model.env is None:
         raise ValueError("model must have an environment to sample episodes from: call set_env first")
     return model.env
+
+
+def check_independent(model: BaseAlgorithm) -> None:
+    """
+    Check that the episodes of a model are independent samples, as the statistics of their gradients take them to be.
+
+    :param model: The model
+    :raises ValueError: If they share noise
+    """
+    if model.use_sde and model.sde_sample_freq != 1:
+        raise ValueError(
+            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, and the "
+            "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
+            "without use_sde"
+        )
