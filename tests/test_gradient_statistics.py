@@ -10,14 +10,8 @@ from test_enumeration import LOGITS, episode_terms, log_pi
 
 from sb3_reinforce.diagnostics.bootstrap import interval, resamples
 from sb3_reinforce.diagnostics.estimator_comparison import estimator_row
-from sb3_reinforce.diagnostics.gradient_statistics import (
-    Moments,
-    gradient_statistics,
-    moments,
-    noise_scale,
-    signal_to_noise,
-    variance,
-)
+from sb3_reinforce.diagnostics.gradient_statistics import gradient_statistics
+from sb3_reinforce.diagnostics.moments import Moments, moments, noise_scale, signal_to_noise, variance
 from sb3_reinforce.diagnostics.tables import as_text
 
 MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
@@ -159,6 +153,7 @@ def test_an_interval_holds_its_estimate_and_can_be_infinite():
         ([[1.0], [2.0]], {}, "must be a tensor"),
         (th.ones(2, 3), {"reference": th.ones(2)}, r"reference.*\(2,\)"),
         (th.ones(2, 3), {"reference": th.zeros(3)}, r"reference.*norm 0"),
+        (th.ones(2, 3), {"reference": [1.0, 1.0, 1.0]}, "reference must be a tensor"),
         (th.ones(2, 3), {"confidence": 95}, "confidence"),
         (th.ones(2, 3), {"n_resamples": 0}, "n_resamples"),
     ],

@@ -5,7 +5,7 @@ import time
 import torch as th
 
 from sb3_reinforce.baselines import ratio_of_others
-from sb3_reinforce.diagnostics.gradient_statistics import gram
+from sb3_reinforce.diagnostics.moments import gram
 from sb3_reinforce.rollouts import Rollout
 from sb3_reinforce.scores import CHUNK, gradients_by_episode, scored_parameters
 

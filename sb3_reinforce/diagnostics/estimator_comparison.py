@@ -1,30 +1,22 @@
 """The families of gradient estimators at one θ: which of them sees the gradient of a task from the fewest steps."""
 
-import copy
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import cast
 
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import baselines
 from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
-from sb3_reinforce.diagnostics.gradient_statistics import cosine, gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
-from sb3_reinforce.diagnostics.sampling import check_independent, sampled
+from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
+from sb3_reinforce.diagnostics.moments import cosine, gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.sampling import check_independent, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.parameters import actor_parameters
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.search_settings import default_delta_std, default_n_delta
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
@@ -79,7 +71,7 @@ def compare_estimators(
     :param delta_std: As for FiniteDifference; None for the rule of thumb
     :param n_resamples: Bootstrap resamples behind the intervals
     :param confidence: Probability that an interval is to cover the truth
-    :param seed: Seed of perturbations, episodes and resamples
+    :param seed: Seed of perturbations, episodes (of the environments too) and resamples
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
         episodes are not independent because they share the noise of gSDE
@@ -87,13 +79,15 @@ def compare_estimators(
     if not isinstance(model, REINFORCE | FiniteDifference):
         raise TypeError(f"model must be a REINFORCE or FiniteDifference, got {model!r} of type {type(model).__name__}")
     check_independent(model)
-    names = tuple(estimators)
-    for name in names:
+    names = (estimators,) if isinstance(estimators, str) else tuple(estimators)
+    for name in names or ("",):
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
     check_integer("n_episodes", n_episodes, 3)
     check_integer("n_estimates", n_estimates, 3)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
+    if n_delta is not None:
+        check_integer("n_delta", n_delta, 2)
     utility = CandidateUtility(model, 1, seed)
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
     scale = (
@@ -102,7 +96,7 @@ def compare_estimators(
     generator = th.Generator().manual_seed(seed)
 
     def difference(name: str) -> Callable[[], tuple[th.Tensor, int]]:
-        k = default_n_delta(name, len(utility.theta)) if n_delta is None else check_integer("n_delta", n_delta, 2)
+        k = default_n_delta(name, len(utility.theta)) if n_delta is None else n_delta
 
         def estimate() -> tuple[th.Tensor, int]:
             before = utility.n_steps
@@ -111,20 +105,21 @@ def compare_estimators(
 
         return estimate
 
-    reference = likelihood_ratio(model, n_episodes)[0]
-    reference_counts = resamples(n_episodes, n_resamples, seed + 1)
     rows = []
-    for name in names:
-        begin = time.perf_counter()
-        if name == LIKELIHOOD_RATIO:
-            gradients, n_steps = likelihood_ratio(model, n_episodes)
-        else:
-            estimate = difference(name)
-            found, made = zip(*(estimate() for _ in range(n_estimates)), strict=True)
-            gradients, n_steps = th.stack(found), sum(made)
-        seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
-        steps = n_steps / len(gradients)
-        rows.append(estimator_row(name, gradients, reference, steps, seconds, counts, reference_counts, confidence))
+    with seeded(model.policy, seed):
+        reference = likelihood_ratio(model, n_episodes)[0]
+        reference_counts = resamples(n_episodes, n_resamples, seed + 1)
+        for name in names:
+            begin = time.perf_counter()
+            if name == LIKELIHOOD_RATIO:
+                gradients, n_steps = likelihood_ratio(model, n_episodes)
+            else:
+                estimate = difference(name)
+                found, made = zip(*(estimate() for _ in range(n_estimates)), strict=True)
+                gradients, n_steps = th.stack(found), sum(made)
+            seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
+            steps = n_steps / len(gradients)
+            rows.append(estimator_row(name, gradients, reference, steps, seconds, counts, reference_counts, confidence))
     return Table(f"Gradient of U(θ) for {len(utility.theta)} parameters by estimator", rows)
 
 
@@ -157,43 +152,3 @@ def estimator_row(
     to_reference = cosine(found, of_reference, products, confidence)
     ratio = interval(signal_to_noise(found) / steps, confidence)
     return EstimatorRow(name, to_reference, ratio, steps, seconds / len(gradients))
-
-
-def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:
-    """
-    Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``.
-
-    :param model: The model
-    :param n_episodes: Number of episodes
-    :return: Shape ``(n_episodes, n)``, float64; and the environment steps that they took, of all environments
-    """
-    plain = as_reinforce(model)
-    sampler, infos = sampled(plain, n_episodes, "leave_one_out")
-    rollout = cast(Rollout, sampler._rollout)
-    baseline = baselines.leave_one_out(rollout)
-    gradients = gradients_by_episode(rollout, rollout.returns - baseline)[0].double().cpu()
-    wanted = {id(parameter) for parameter in actor_parameters(plain.policy)}
-    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
-    return gradients[:, mask], len(infos.infos) * cast(VecEnv, plain.env).num_envs
-
-
-def as_reinforce(model: BaseAlgorithm) -> REINFORCE:
-    """
-    A REINFORCE at γ = 1 with a model's policy and environments, which keeps nothing of its own.
-
-    :param model: A REINFORCE or FiniteDifference
-    """
-    if isinstance(model, REINFORCE):
-        plain = copy.copy(model)
-    else:
-        plain = REINFORCE(
-            type(model.policy),  # type: ignore[arg-type]
-            cast(VecEnv, model.env),
-            policy_kwargs=model.policy_kwargs,
-            max_episode_steps=getattr(model, "max_episode_steps", 100_000),
-            device=model.device,
-        )
-        plain.policy = cast(ActorCriticPolicy, model.policy)
-    plain.gamma, plain.gae_lambda, plain.reward_to_go, plain.discount_scores = 1.0, 1.0, True, False
-    plain.baseline = "leave_one_out"
-    return plain

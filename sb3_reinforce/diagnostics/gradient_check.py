@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch as th
-
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error
 from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
-from sb3_reinforce.diagnostics.sampling import check_model, sampled
+from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.policies import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
@@ -68,16 +66,14 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     """
     check_model(model)
     check_integer("n_episodes", n_episodes, 2)
-    policy, optimizer, training = model.policy, model.policy.optimizer, model.policy.training
+    policy, optimizer = model.policy, model.policy.optimizer
     state = {name: value.clone() for name, value in policy.state_dict().items()}
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(check_integer("seed", seed, 0))
+    with seeded(policy, check_integer("seed", seed, 0)):
         try:
             rows = check_rows(model, n_episodes)
         finally:
             policy.load_state_dict(state)
             policy.optimizer = optimizer
-            policy.set_training_mode(training)
     return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows)
 
 

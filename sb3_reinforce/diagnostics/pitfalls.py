@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.moments import gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.updates import Seen, Update
 
 Pitfall: TypeAlias = Callable[[Seen], str | None]

@@ -11,7 +11,7 @@ from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
 from sb3_reinforce.collection import by_step
 from sb3_reinforce.diagnostics.comparisons import functions_of
-from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model
 from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE

@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.arguments import check_integer
@@ -53,13 +55,16 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     return sampler._rollout
 
 
-def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | None = None) -> tuple[AnyREINFORCE, Infos]:
+def sampled(
+    model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | None = None, seed: int | None = None
+) -> tuple[AnyREINFORCE, Infos]:
     """
     A copy of the model, which shares its policy and environments, after it has collected a rollout; and the infos.
 
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: As for ``sample``
+    :param seed: The seed of the environments; None to let them go on
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
@@ -75,10 +80,29 @@ def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | Non
     callback = Infos()
     callback.init_callback(sampler)
     with undisturbed(model):
+        if seed is not None:
+            env.seed(seed)
         sampler._last_obs = env.reset()  # type: ignore[assignment]
         sampler._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         sampler.collect_rollouts(env, callback, sampler.rollout_buffer, None)
     return sampler, callback
+
+
+@contextmanager
+def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
+    """
+    Draw from a seed in the block, and leave PyTorch's generator and the mode of a policy as they were.
+
+    :param policy: The policy
+    :param seed: The seed
+    """
+    training = policy.training
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        try:
+            yield
+        finally:
+            policy.set_training_mode(training)
 
 
 @contextmanager
