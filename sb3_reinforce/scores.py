@@ -80,14 +80,16 @@ def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHU
     w = (w[:, slots] * filled.to(w)).transpose(0, 1)
     result = w.new_zeros(len(weights), int(episode[-1]) + 1, sum(parameter.numel() for parameter in parameters))
     products_of = th.func.vmap(partial(vector_jacobian_products, LogProb(policy), parameters))
-    rows = max(1, chunk // (len(weights) * result.shape[-1]))
     try:
-        for begin in range(0, len(slots), rows):
-            part = slice(begin, begin + rows)
-            products = products_of(take(obs, slots[part]), actions[slots[part]], w[part])
-            result.index_add_(1, episode[part].to(result.device), products.transpose(0, 1))
+        # One step: an error of the policy's own comes again below, and memory cannot run out
+        products_of(take(obs, slots[:1, :1]), actions[slots[:1, :1]], w[:1, :, :1])
     except RuntimeError:
         return th.stack([th.stack(gradients) for gradients in episode_gradients(rollout, *weights)], dim=1)
+    rows = max(1, chunk // (len(weights) * result.shape[-1]))
+    for begin in range(0, len(slots), rows):
+        part = slice(begin, begin + rows)
+        products = products_of(take(obs, slots[part]), actions[slots[part]], w[part])
+        result.index_add_(1, episode[part].to(result.device), products.transpose(0, 1))
     return result
 
 

@@ -162,6 +162,16 @@ def test_negation_is_seen_in_every_action_space():
         assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
 
 
+@pytest.mark.parametrize("policy", ["MlpPolicy", Negated])
+def test_a_policy_without_randomness_does_not_pass_unchecked(policy):
+    model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
+    with th.no_grad():
+        model.policy.action_net.bias.copy_(th.tensor([80.0, 0.0, 0.0]))
+    table = check_gradient(model)
+    assert np.isnan(table["sign"].error)
+    assert "sign" in table.failures
+
+
 def test_returns_by_definition_are_the_recursive_ones():
     rewards, values, dones = np.random.randn(9), np.random.randn(9), np.arange(9) == 8
     for gamma, lam in ((0.9, 0.7), (1.0, 1.0), (0.5, 0.0)):

@@ -52,10 +52,11 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
     ``log_prob``: log π that training differentiates is log π of the actions drawn. ``scores``: its gradient by autograd
     is that by finite differences. ``sign``: a step along the score of an action makes the policy draw it more often, or
-    draw nearer to it. ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
-    ``surrogate``: the step of ``train()`` is the sum of the weighted scores. A policy of one's own, or a subclass of
-    REINFORCE, is checked as it is. With gSDE ``scores`` fails as Stable-Baselines3 makes it: the standard deviation's
-    dependence on the features is detached there, unless ``policy.action_dist.learn_features`` is set.
+    draw nearer to it; a policy that always draws the same cannot be checked for it, and does not pass. ``returns`` and
+    ``weights``: G_t and G_t − b_t follow from the rewards by their definitions. ``surrogate``: the step of ``train()``
+    is the sum of the weighted scores. A policy of one's own, or a subclass of REINFORCE, is checked as it is. With gSDE
+    ``scores`` fails as Stable-Baselines3 makes it: the standard deviation's dependence on the features is detached
+    there, unless ``policy.action_dist.learn_features`` is set.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes, at least 2

@@ -93,19 +93,32 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -
     :param policy: The policy
     :param obs: ``n`` observations
     :param n_actions: Actions to try, at most n
+    :return: NaN if all draws are alike, as those of a policy without randomness are: nothing could be tried
     """
     n_obs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
     wrong, tried = 0, 0
     for index in th.randperm(n_obs)[:n_actions]:
         repeated = take(obs, index.repeat(N_DRAWS))
         with th.no_grad():
-            draws = flat_actions(policy, policy(repeated)[0])
+            draws = draw(policy, repeated)
         # Of a few draws the one that is farthest from the rest: a step along its score is the plainest to see
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
         before, after = closeness_after_step(policy, repeated, action)
         if before < closeness(policy, action[None].expand_as(draws), action):
             wrong, tried = wrong + int(after <= before), tried + 1
-    return wrong / max(1, tried)
+    return wrong / tried if tried else float("nan")
+
+
+def draw(policy: ActorCriticPolicy, obs: PyTorchObs) -> th.Tensor:
+    """
+    ``N_DRAWS`` independent actions; with gSDE each by a noise matrix of its own.
+
+    :param policy: The policy
+    :param obs: One observation, ``N_DRAWS`` times
+    """
+    if policy.use_sde:
+        policy.reset_noise(N_DRAWS)
+    return flat_actions(policy, policy(obs)[0])
 
 
 def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:
@@ -141,6 +154,6 @@ def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.
         th.nn.utils.vector_to_parameters(values, parameters)
         with th.random.fork_rng(devices=[]), th.no_grad():
             th.manual_seed(seed)
-            results.append(closeness(policy, flat_actions(policy, policy(obs)[0]), action))
+            results.append(closeness(policy, draw(policy, obs), action))
     th.nn.utils.vector_to_parameters(theta, parameters)
     return results[0], results[1]
