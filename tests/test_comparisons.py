@@ -16,13 +16,14 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.baselines import BASELINES
 from sb3_reinforce.diagnostics import (
     GradientQualityCallback,
+    baseline_gradients,
     compare_baselines,
     compare_estimators,
     gradient_statistics,
     gradients_by_episode,
     sample,
 )
-from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals
+from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals, gradient_blocks
 from sb3_reinforce.scores import episode_gradients
 
 BOX = spaces.Box(-1, 1, (1,))
@@ -166,6 +167,27 @@ def test_rows_are_the_variances_of_the_gradients_themselves():
         weights = rollout.discounts * (rollout.returns - baseline(rollout))
         gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
         assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("floats", [1, 5000, 2**26])
+def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeypatch, floats):
+    env = make_vec_env("CartPole-v1", 3, seed=1)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": [5]}, seed=1, device="cpu")
+    rollout = sample(model, 6)
+    baselines = {name: function(rollout) for name, function in BASELINES.items() if name != "optimal"}
+    sizes = []
+
+    def blocks(*args):
+        for block in gradient_blocks(*args, floats=floats):
+            sizes.append(block.numel())
+            yield block
+
+    monkeypatch.setattr(baseline_gradients, "gradient_blocks", blocks)
+    found, _ = baseline_gradients.grams(rollout, baselines)
+    assert max(sizes) <= max(floats, 5 * 6)
+    for name, function in BASELINES.items():
+        gradients = gradients_by_episode(rollout, rollout.returns - function(rollout))[0].double()
+        th.testing.assert_close(found[name], gradients @ gradients.T, rtol=1e-4, atol=1e-4 * float(found[name].max()))
 
 
 def test_time_or_state_halve_the_variance_on_cartpole():

@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import Logger, configure
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import GradientQualityCallback
-from sb3_reinforce.diagnostics.quality_callback import first_episodes
+from sb3_reinforce.diagnostics.quality_callback import evenly_spread
 from sb3_reinforce.scores import episode_gradients
 
 
@@ -63,12 +63,33 @@ def test_the_variance_is_that_of_the_episodes_gradients():
     assert history["gradient/snr"] == [pytest.approx(8 * signal / trace, rel=1e-3)]
 
 
+def test_the_signal_to_noise_ratio_is_that_of_the_weights_of_training():
+    model = train(GradientQualityCallback(1), 1, baseline="mean", n_episodes=8, learning_rate=0.0)
+    rollout = model._rollout
+    weights = rollout.returns - rollout.returns[rollout.used].mean()
+    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
+    trace = float(gradients.var(0).sum())
+    signal = float(gradients.mean(0).square().sum()) - trace / 8
+    assert model.logger.history["gradient/snr"] == [pytest.approx(8 * signal / trace, rel=1e-3)]
+
+
+def test_no_baseline_is_given_more_episodes_than_allowed():
+    given = []
+
+    def counted(rollout):
+        given.append(len(th.unique(rollout.episodes[rollout.used])))
+        return rollout.returns * 0
+
+    train(GradientQualityCallback(1, [counted], max_episodes=4), 1, baseline="none", n_episodes=20)
+    assert given == [4]
+
+
 def test_no_more_episodes_than_allowed_are_looked_at():
     model = train(timesteps=1, baseline="none", n_episodes=12)
-    few = first_episodes(model._rollout, 5)
+    few = evenly_spread(model._rollout, 5)
     assert len(th.unique(few.episodes[few.used])) == 5
     assert few.used.sum() < model._rollout.used.sum()
-    assert first_episodes(model._rollout, 12) is model._rollout
+    assert evenly_spread(model._rollout, 12) is model._rollout
 
 
 def test_a_single_episode_has_no_variance_to_log():

@@ -36,6 +36,8 @@ def assert_as_one_by_one(rollout, **kwargs):
     after = rollout.policy.named_parameters(remove_duplicate=False)
     assert all(old is new for (_, old), (_, new) in zip(before, after, strict=True)), "the policy is as it was"
     th.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4 * float(alone.abs().max()))
+    part = gradients_by_episode(rollout, *weights, columns=slice(3, 6), **kwargs)
+    th.testing.assert_close(part, together[..., 3:6])
 
 
 @pytest.mark.parametrize("action_space", ACTION_SPACES)

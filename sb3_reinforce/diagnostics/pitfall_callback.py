@@ -8,9 +8,8 @@ from typing import cast
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_reinforce.collection import by_step
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
-from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.updates import Seen, Update
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
@@ -52,7 +51,7 @@ class PitfallCallback(BaseCallback):
         rollout = self.rollout = cast(Rollout, model._rollout)
         self.parameters = self.parameters or scored_parameters(rollout)
         log_prob = self.log_prob(rollout)
-        weights = th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)) * rollout.discounts
+        weights = training_weights(model) * rollout.discounts
         weighed = (log_prob * weights[rollout.used][: len(log_prob)].to(log_prob)).sum()
         gradient = flat(th.autograd.grad(weighed, self.parameters))
         self.before, self.gradient = log_prob.detach(), gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
+from sb3_reinforce.collection import by_step
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
 
@@ -168,3 +169,13 @@ def check_independent(model: BaseAlgorithm) -> None:
             "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
             "without use_sde"
         )
+
+
+def training_weights(model: REINFORCE) -> th.Tensor:
+    """
+    What training reads as G_t − b_t, before or after it has trained on the rollout.
+
+    :param model: A model that has collected a rollout
+    :return: Shape ``(n_steps, n_envs)``, float64
+    """
+    return th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)).double()
