@@ -8,8 +8,9 @@ import torch as th
 from environments import Corridor, Tree
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
@@ -52,6 +53,15 @@ def test_every_action_space_passes(action_space, kwargs):
 def test_other_policies_and_arguments_pass(policy, env, kwargs):
     table = check_gradient(REINFORCE(policy, env, device="cpu", seed=0, **kwargs))
     assert table.passed, table
+
+
+def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
+    env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=1, discrete=True)
+    seen, forward = [], NatureCNN.forward
+    monkeypatch.setattr(NatureCNN, "forward", lambda self, obs: seen.append(len(obs)) or forward(self, obs))
+    table = check_gradient(REINFORCE("CnnPolicy", env, baseline="none", n_episodes=2, device="cpu", seed=0), 2)
+    assert table.passed, table
+    assert max(seen) <= 2**21 // 84**2
 
 
 def test_gsde_cuts_its_scores_unless_it_learns_features():

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sb3_reinforce.arguments import check_integer
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error, some
 from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
 from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
 from sb3_reinforce.diagnostics.tables import Table
@@ -92,8 +92,10 @@ def check_rows(model: REINFORCE, n_episodes: int) -> list[CheckRow]:
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
     scored_parameters(rollout)
     return [
-        row("log_prob", log_prob_error(policy, obs), 1e-4, "log π(a|s) when drawn and when evaluated"),
-        row("scores", score_error(policy, obs, actions), 0.02, "∇ log π by autograd and by differences"),
+        row(
+            "log_prob", log_prob_error(policy, some(obs, actions)[0]), 1e-4, "log π(a|s) when drawn and when evaluated"
+        ),
+        row("scores", score_error(policy, *some(obs, actions)), 0.02, "∇ log π by autograd and by differences"),
         row("sign", sign_error(policy, obs), 0.0, "share of actions that their own score repels"),
         row("returns", return_error(sampler, rollout, infos), 1e-4, "G_t and its definition, from the rewards"),
         row("weights", weight_error(sampler, rollout), 1e-4, "the weights of training and G_t − b_t"),
