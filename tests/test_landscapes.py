@@ -79,6 +79,14 @@ def test_a_users_mistake_is_named_before_anything_is_sampled(kwargs, message):
         compare_estimators(model, **kwargs)
 
 
+def test_by_default_every_estimator_sees_something_on_cartpole():
+    env = make_vec_env("CartPole-v1", 8, seed=0)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": {"pi": [], "vf": [64]}}, device="cpu", seed=0)
+    for row in compare_estimators(model):
+        assert row.snr_per_step.low > 0, row
+        assert row.cosine.low > 0, row
+
+
 def test_a_single_name_is_an_estimator():
     assert compare_estimators(bandit(), 10, 3, "central").names == ["central"]
 

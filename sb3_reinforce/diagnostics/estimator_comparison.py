@@ -44,11 +44,11 @@ class EstimatorRow:
 def compare_estimators(
     model: REINFORCE | FiniteDifference,
     n_episodes: int = 100,
-    n_estimates: int = 10,
+    n_estimates: int = 50,
     estimators: Iterable[str] = (LIKELIHOOD_RATIO, "forward", "central", "regression"),
-    perturbation: str | Perturbation = "gaussian",
+    perturbation: str | Perturbation = "coordinate",
     n_delta: int | None = None,
-    delta_std: float | None = None,
+    delta_std: float | None = 1.0,
     n_resamples: int = 500,
     confidence: float = 0.95,
     seed: int = 0,
@@ -64,11 +64,13 @@ def compare_estimators(
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes of the likelihood ratio, and as many again for the gradient to compare with, at least 3
-    :param n_estimates: Estimates by each of the others, at least 3
+    :param n_estimates: Estimates by each of the others, at least 3; below about 20 the intervals are too narrow
     :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
-    :param perturbation: As for FiniteDifference
+    :param perturbation: As for FiniteDifference. As many Gaussian perturbations as parameters are all but dependent,
+        and a difference that is solved for them is mostly noise; coordinates are not
     :param n_delta: As for FiniteDifference; None for the rule of thumb
-    :param delta_std: As for FiniteDifference; None for the rule of thumb
+    :param delta_std: As for FiniteDifference, whose rule of thumb None stands for. A single episode behind a utility is
+        too noisy for steps as small as those of training, so that the default is larger
     :param n_resamples: Bootstrap resamples behind the intervals
     :param confidence: Probability that an interval is to cover the truth
     :param seed: Seed of perturbations, episodes (of the environments too) and resamples
