@@ -111,6 +111,7 @@ def seen(updates=(), n_updates=100, progress=1.0, **kwargs):
         "grad_norm": 1.0,
         "explained_variance": 0.5,
         "return_scale": 10.0,
+        "return_std": 5.0,
         "n_episodes": 16,
         "n_steps": 256,
         "used_fraction": 1.0,
@@ -157,6 +158,11 @@ def signal(strength):
             "useless_critic",
             lambda: seen([{"explained_variance": -0.1}] * 50, progress=0.4),
             lambda: seen([{"explained_variance": -0.1}] * 50, progress=0.6),
+        ),
+        (
+            "useless_critic",
+            lambda: seen([{"explained_variance": 0.0, "return_std": 1.1}] * 50, progress=0.4),
+            lambda: seen([{"explained_variance": 0.0, "return_std": 0.9}] * 50, progress=0.4),
         ),
         (
             "deterministic_too_early",

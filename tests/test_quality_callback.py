@@ -6,10 +6,11 @@ import sys
 import pytest
 import torch as th
 from environments import Corridor, Tree
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import GradientQualityCallback
 from sb3_reinforce.diagnostics.quality_callback import evenly_spread
 from sb3_reinforce.scores import episode_gradients
@@ -90,6 +91,26 @@ def test_no_more_episodes_than_allowed_are_looked_at():
     assert len(th.unique(few.episodes[few.used])) == 5
     assert few.used.sum() < model._rollout.used.sum()
     assert evenly_spread(model._rollout, 12) is model._rollout
+
+
+def test_of_finite_differences_it_logs_the_cosine_between_updates():
+    model = FiniteDifference("LinearPolicy", Tree(), learning_rate=0.1, seed=0)
+    model.set_logger(Recorded())
+    thetas = []
+
+    class Thetas(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            thetas.append(model.theta)
+
+    history = model.learn(200, [Thetas(), GradientQualityCallback(1)]).logger.history
+    assert {key for key in history if key.startswith("gradient/")} == {"gradient/cosine"}
+    steps = th.stack(thetas).diff(dim=0)
+    expected = th.cosine_similarity(steps[1:], steps[:-1]).tolist()
+    assert len(expected) >= 2
+    assert history["gradient/cosine"] == pytest.approx(expected)
 
 
 def test_a_single_episode_has_no_variance_to_log():

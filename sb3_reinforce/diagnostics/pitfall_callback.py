@@ -26,6 +26,8 @@ class PitfallCallback(BaseCallback):
     the cost is three forward passes and a backward pass over at most 256 steps of a rollout. Nothing of the training
     is changed.
 
+    They are those of the likelihood ratio: a FiniteDifference has no returns to weigh, and is refused.
+
     :param verbose: Verbosity level
     :raises TypeError: If the model is not a REINFORCE
     """
@@ -124,6 +126,7 @@ class PitfallCallback(BaseCallback):
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,
             return_scale=float(rollout.returns[used].square().mean().sqrt()),
+            return_std=float(rollout.returns[used].std(correction=0)),
             n_episodes=len(th.unique(rollout.episodes[used])),
             n_steps=int(used.sum()),
             used_fraction=float(used.double().mean()),

@@ -116,9 +116,11 @@ def useless_critic(seen: Seen) -> str | None:
     """
     A critic whose values explain none of the variance of the returns, after 100 updates and half of the training.
 
+    Returns that vary by less than a tenth of their size, as those of a pole that never falls, leave little to explain.
+
     :param seen: What was seen
     """
-    explained = [update.explained_variance for update in seen.updates if math.isfinite(update.explained_variance)]
+    explained = [update.explained_variance for update in seen.updates if worth_explaining(update)]
     late = seen.n_updates >= 100 and seen.model._current_progress_remaining < 0.5
     if seen.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
         return (
@@ -127,6 +129,15 @@ def useless_critic(seen: Seen) -> str | None:
             "scale the returns (VecNormalize), or use another baseline"
         )
     return None
+
+
+def worth_explaining(update: Update) -> bool:
+    """
+    Whether there is a critic, and returns that vary.
+
+    :param update: The update
+    """
+    return math.isfinite(update.explained_variance) and update.return_std > 0.1 * update.return_scale
 
 
 def deterministic_too_early(seen: Seen) -> str | None:

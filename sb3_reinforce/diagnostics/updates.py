@@ -19,6 +19,7 @@ class Update:
     :param explained_variance: Of the critic; NaN without one
     :param gradient: Some components of the gradient, shape ``(c,)``
     :param return_scale: Root mean square of the returns
+    :param return_std: Standard deviation of the returns
     :param n_episodes: Episodes in the rollout, parts of episodes too
     :param n_steps: Steps used
     :param used_fraction: Share of the steps that were used
@@ -31,6 +32,7 @@ class Update:
     explained_variance: float
     gradient: th.Tensor
     return_scale: float
+    return_std: float
     n_episodes: int
     n_steps: int
     used_fraction: float
