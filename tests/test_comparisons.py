@@ -220,6 +220,17 @@ def test_the_model_is_as_it_was_and_goes_on():
     assert model.num_timesteps == 32
 
 
+def test_the_model_knows_that_an_episode_begins():
+    """Left in the middle of one, with the flags of the last step, its next rollout would go on counting."""
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=7, device="cpu").learn(7)
+    assert not model._last_episode_starts.all()
+    rollout = sample(model, 3)
+    assert model._last_episode_starts.all()
+    assert rollout.timesteps[:, 0].tolist() == [*range(5)] * 3
+    model.learn(7, reset_num_timesteps=False)
+    assert model._rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
+
+
 def half(rollout):
     return rollout.returns * 0 + 0.5
 

@@ -82,7 +82,7 @@ def compare_baselines(
     counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
     with seeded(model.policy, seed):
         rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
-    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes)", rows)
+    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes; floor: of constants)", rows)
 
 
 def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -> dict[str, Baseline]:
