@@ -58,9 +58,9 @@ def compare_baselines(
     have a smaller variance; a baseline that knows the time or the state can.
 
     What all names cost with an MlpPolicy and 100 episodes of CartPole-v1, in plain forward and backward passes over
-    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of three or four runs, one thread of a
-    busy machine): 0.8 to 1.1 before training, and 1.5 to 1.7 with collecting the episodes; for a trained policy, whose
-    episodes last 500 steps, 1.2 to 1.9, and 6.0 to 8.1 with collecting them, most of it the environments' own time.
+    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of 11 runs, one thread): 1.3 before
+    training, and 2.3 with collecting the episodes; for a trained policy, whose episodes last 500 steps, 1.9, and 8.6
+    with collecting them, which is the environments' own time for the most part.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes, at least 3
