@@ -19,7 +19,8 @@ from stable_baselines3.common.vec_env.util import dict_to_obs
 
 def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
     """
-    How to step an environment. A subclass of ``DummyVecEnv``, or one whose methods were replaced, is asked itself.
+    How to step an environment. A subclass of ``DummyVecEnv``, or one on which a method for stepping was replaced, is
+    asked itself.
 
     :param env: The environments
     :return: A function of actions of shape ``(n_envs, ...)``
@@ -40,19 +41,21 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     :param env: The environments
     :param actions: Shape ``(n_envs, ...)``
     """
-    rewards, dones, infos = np.empty(env.num_envs, dtype=np.float32), np.empty(env.num_envs, dtype=bool), []
+    env.step_async(actions)
+    infos = []
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
-        obs, rewards[i], terminated, truncated, info = single.step(action)
+        obs, env.buf_rews[i], terminated, truncated, info = single.step(action)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
-        dones[i] = terminated or truncated
+        env.buf_dones[i] = terminated or truncated
         if terminated or truncated:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
         env._save_obs(i, obs)
         infos.append(info)
+    env.buf_infos = infos
     rows = {key: part.copy() for key, part in env.buf_obs.items()}
-    return dict_to_obs(env.observation_space, rows), rewards, dones, infos
+    return dict_to_obs(env.observation_space, rows), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()
 
 
 def step_workers(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
@@ -78,4 +81,6 @@ def step_workers(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
         # A pipe may close a moment before its process is gone
         gone = wait(sentinels, timeout=5)
         dead = [i for i, sentinel in enumerate(sentinels) if sentinel in gone]
+        if not dead:
+            raise
         raise ConnectionError(f"The worker of environment {', '.join(map(str, dead))} died") from error
