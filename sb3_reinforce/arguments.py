@@ -169,3 +169,17 @@ def check_finite(name: str, values: Any, where: tuple[int, ...] = ()) -> None:
         f"{name} of environment {env} at step {step} of the rollout is not finite: {values[first]}. "
         "The policy has not been updated with this rollout."
     )
+
+
+def check_learn(total_timesteps: Any, log_interval: Any) -> None:
+    """
+    Check the arguments of ``learn`` that both algorithms have.
+
+    :param total_timesteps: Environment steps
+    :param log_interval: Updates between two entries of the log; None for no log
+    :raises TypeError: If one is not a number
+    :raises ValueError: If one is out of its range
+    """
+    check_number("total_timesteps", total_timesteps, 0)
+    if log_interval is not None:
+        check_integer("log_interval", log_interval, 1)

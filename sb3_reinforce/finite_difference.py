@@ -22,14 +22,14 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce import optimization, parameters
-from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce.arguments import CheckedSchedule, check_function, check_learn, check_spaces
 from sb3_reinforce.candidate_actors import LoopActor, make_actor
 from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.collection import shift_to_start
 from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
 from sb3_reinforce.linear_policy import LinearPolicy
 from sb3_reinforce.normalization import frozen
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.prediction import predict
 from sb3_reinforce.search_settings import (
     check_candidates,
     check_deltas,
@@ -101,6 +101,7 @@ class FiniteDifference(BaseAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     policy: ActorCriticPolicy
+    predict = predict
 
     def __init__(
         self,
@@ -212,9 +213,7 @@ class FiniteDifference(BaseAlgorithm):
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         """
-        check_number("total_timesteps", total_timesteps, 0)
-        if log_interval is not None:
-            check_integer("log_interval", log_interval, 1)
+        check_learn(total_timesteps, log_interval)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -382,25 +381,6 @@ class FiniteDifference(BaseAlgorithm):
         self.logger.record("time/time_elapsed", int(time_elapsed), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
-
-        :param observation: The input observation
-        :param state: Passed on; the policies are not recurrent
-        :param episode_start: Passed on
-        :param deterministic: Whether to return the most likely action instead of a sample
-        :return: The action and ``state``
-        """
-        actions, state = super().predict(observation, state, episode_start, deterministic)
-        return shift_to_start(self.action_space, actions), state
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"

@@ -20,9 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce import optimization
-from sb3_reinforce.arguments import CheckedSchedule, check_function, check_integer, check_number, check_spaces
+from sb3_reinforce.arguments import CheckedSchedule, check_function, check_learn, check_spaces
 from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.collection import check_data, collect, shift_to_start, warn_of_own_methods
+from sb3_reinforce.collection import check_data, collect, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
 from sb3_reinforce.policies import (
     Parameters,
@@ -31,6 +31,7 @@ from sb3_reinforce.policies import (
     set_temperature,
     split_parameters,
 )
+from sb3_reinforce.prediction import predict
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
 from sb3_reinforce.settings import check_reinforce
 from sb3_reinforce.weighing import Running, Steps, Weighing, used_steps, weigh
@@ -111,6 +112,7 @@ class REINFORCE(OnPolicyAlgorithm):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
+    predict = predict
 
     def __init__(
         self,
@@ -359,25 +361,6 @@ class REINFORCE(OnPolicyAlgorithm):
             return rollout.used.numel()
         return int(rollout.used.sum()) if self.normalize_by == "steps" else cast(int, self.n_episodes)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
-
-        :param observation: The input observation
-        :param state: Passed on; the policies are not recurrent
-        :param episode_start: Passed on
-        :param deterministic: Whether to return the most likely action instead of a sample
-        :return: The action and ``state``
-        """
-        actions, state = super().predict(observation, state, episode_start, deterministic)
-        return shift_to_start(self.action_space, actions), state
-
     def learn(
         self: SelfREINFORCE,
         total_timesteps: int,
@@ -399,9 +382,7 @@ class REINFORCE(OnPolicyAlgorithm):
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
         """
-        check_number("total_timesteps", total_timesteps, 0)
-        if log_interval is not None:
-            check_integer("log_interval", log_interval, 1)
+        check_learn(total_timesteps, log_interval)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
