@@ -29,5 +29,5 @@ model = REINFORCE(
 model.learn(arguments.timesteps)
 
 print(check_gradient(model), end="\n\n")
-print(compare_estimators(model, n_episodes=100, delta_std=0.3, seed=arguments.seed), end="\n\n")
+print(compare_estimators(model, seed=arguments.seed), end="\n\n")
 print(compare_baselines(model, n_episodes=100, seed=arguments.seed))

@@ -35,22 +35,25 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     return number
 
 
-def check_integer(name: str, value: Any, low: int) -> int:
+def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     """
-    Return ``value`` as an int if it is an integer of at least ``low``.
+    Return ``value`` as an int if it is an integer in the range.
 
     :param name: Name of the argument, for the message
     :param value: What the user passed
     :param low: Smallest allowed value
+    :param high: Largest allowed value
     :return: The value
     :raises TypeError: If ``value`` is not an integer
-    :raises ValueError: If ``value`` is smaller than ``low``
+    :raises ValueError: If ``value`` is not in the range
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral):
         raise TypeError(f"{name} must be an integer, got {value!r} of type {type(value).__name__}")
-    if value < low:
-        raise ValueError(f"{name} must be at least {low}, got {value!r}")
-    return int(value)
+    number = int(value)
+    if not low <= number <= high:
+        at_most = f" and at most {high}" * (high < math.inf)
+        raise ValueError(f"{name} must be at least {low}{at_most}, got {value!r}")
+    return number
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -101,6 +104,8 @@ def check_function(name: str, value: Any, functions: dict[str, Callable[..., Any
 
 # A larger step can take a parameter out of the range of float32
 MAX_LEARNING_RATE = 1e6
+# What NumPy takes
+MAX_SEED = 2**32 - 1
 
 
 class CheckedSchedule(FloatSchedule):
@@ -126,7 +131,7 @@ class CheckedSchedule(FloatSchedule):
 
     def __call__(self, progress_remaining: float) -> float:
         value = self.value_schedule(progress_remaining)
-        value = value.item() if getattr(value, "size", 1) == 1 and hasattr(value, "item") else value
+        value = value.item() if hasattr(value, "item") and np.size(value) == 1 else value
         return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, self.above)
 
 
@@ -141,7 +146,7 @@ def check_basics(
     :param stats_window_size: 1 or more
     :param tensorboard_log: None or a path
     :param verbose: 0 or more
-    :param seed: None, or 0 or more
+    :param seed: None, or from 0 to 2**32 - 1
     :param device: A device, or "auto"
     :raises TypeError: If one is of the wrong kind
     :raises ValueError: If one is out of its range
@@ -153,7 +158,7 @@ def check_basics(
     check_integer("stats_window_size", stats_window_size, 1)
     check_integer("verbose", verbose, 0)
     if seed is not None:
-        check_integer("seed", seed, 0)
+        check_integer("seed", seed, 0, MAX_SEED)
     check_kind("device", device, (str, th.device), optional=False)
     if device != "auto":
         try:
@@ -180,7 +185,13 @@ def check_kind(name: str, value: Any, kinds: tuple[type, ...], optional: bool = 
 
 
 def check_learn(
-    env: Any, total_timesteps: Any, callback: Any, log_interval: Any, tb_log_name: Any, *flags: tuple[str, Any]
+    env: Any,
+    total_timesteps: Any,
+    callback: Any,
+    log_interval: Any,
+    tb_log_name: Any,
+    reset_num_timesteps: Any,
+    progress_bar: Any,
 ) -> None:
     """
     Check the arguments of ``learn``.
@@ -190,7 +201,8 @@ def check_learn(
     :param callback: None, a callback, a function or a list of callbacks
     :param log_interval: 1 or more, or None
     :param tb_log_name: A name
-    :param flags: Name and value of the others
+    :param reset_num_timesteps: True or False
+    :param progress_bar: True or False
     :raises TypeError: If one is of the wrong kind
     :raises ValueError: If one is out of its range, or the model has no environment
     """
@@ -200,8 +212,8 @@ def check_learn(
     if log_interval is not None:
         check_integer("log_interval", log_interval, 1)
     check_kind("tb_log_name", tb_log_name, (str,), optional=False)
-    for name, value in flags:
-        check_flag(name, value)
+    check_flag("reset_num_timesteps", reset_num_timesteps)
+    check_flag("progress_bar", progress_bar)
     for each in callback if isinstance(callback, list) else [callback]:
         is_one = isinstance(each, BaseCallback) or (callable(each) and not isinstance(each, type) and each is callback)
         if not (is_one or callback is None):

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.actors import make_actor
-from sb3_reinforce.environment_checks import check_finite, check_observation
+from sb3_reinforce.environment_checks import check_finite
 from sb3_reinforce.returns import Bools
 from sb3_reinforce.rollouts import Extent
 from sb3_reinforce.stepping import stepper
@@ -219,5 +219,4 @@ def check_data(buffer: RolloutBuffer, last_obs: Any, terminal_obs: dict[tuple[in
     check_finite("The observation", buffer.observations)
     check_finite("The observation", last_obs, (buffer.pos,))
     for where, obs in terminal_obs.items():
-        check_observation(buffer.observation_space, obs, where[1])
         check_finite("The terminal observation", obs, where)

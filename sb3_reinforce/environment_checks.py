@@ -1,5 +1,7 @@
-"""Checks of environments and of what they return: each error names the environment, and the step where there is one."""
+"""Checks of environments and of what they return. Each error names the environment; ``learn`` adds the step."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -7,6 +9,11 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+
+class BadData(ValueError):
+    """What an environment returned at this step cannot be learned from."""
 
 
 def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
@@ -49,11 +56,11 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
     if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
         raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
-    if is_empty(action_space):
+    if 0 in (action_space.shape or ()):
         raise ValueError(f"The action space must not be empty, got {action_space}")
-    if isinstance(observation_space, spaces.Dict) and not observation_space.spaces:
-        raise ValueError(f"The observation space must not be empty, got {observation_space}")
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+    if not parts:
+        raise ValueError(f"The observation space must not be empty, got {observation_space}")
     for key, space in parts.items():
         where = f" under {key!r}" if key else ""
         if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
@@ -61,48 +68,62 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
                 f"got {space}"
             )
-        if is_empty(space):
+        if 0 in (space.shape or ()):
             raise ValueError(f"The observation space{where} must not be empty, got {space}")
         if np.any(getattr(space, "start", 0)):
             raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
 
 
-def is_empty(space: spaces.Space[Any]) -> bool:
+def all_finite(values: np.ndarray) -> bool:
     """
-    Whether an element of a space has no numbers in it.
+    Whether all numbers are finite.
 
-    :param space: A Box or a discrete space
+    :param values: Any shape
     """
-    return 0 in (space.shape or ())
+    # One product costs less than isfinite and all; where it overflows, they decide
+    return values.dtype.kind != "f" or math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
 
 
-def check_finite(name: str, values: Any, where: tuple[int, ...] = (), since: str = "of the rollout") -> None:
+def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
     """
-    Check numbers that came from an environment.
+    Check numbers that came from environments.
 
     :param name: What they are, for the message
     :param values: An array of shape ``(n_steps, n_envs, ...)`` less the dimensions in ``where``, or a dict of them
-    :param where: The step, or the step and the environment, that ``values`` belong to
-    :param since: What the steps are counted from, for the message
+    :param where: The step of the rollout, or the step and the environment, that ``values`` belong to; None for the
+        present step
     :raises ValueError: Naming the first step and environment where a number is not finite
     """
     if isinstance(values, dict):
         for key, part in values.items():
-            check_finite(f"{name} {key!r}", part, where, since)
+            check_finite(f"{name} {key!r}", part, where)
         return
     values = np.asarray(values)
-    if values.dtype.kind != "f":
+    if all_finite(values):
         return
-    finite = np.isfinite(values)
-    # all() costs several times as much on a few numbers
-    if np.count_nonzero(finite) == finite.size:
-        return
-    first = tuple(int(i) for i in np.argwhere(~finite)[0])
+    first = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
     step, env = (*where, *first)[:2]
+    if step is None:
+        raise BadData(f"{name} of environment {env} is not finite: {values[first]}")
     raise ValueError(
-        f"{name} of environment {env} at step {step} {since} is not finite: {values[first]}. "
+        f"{name} of environment {env} at step {step} of the rollout is not finite: {values[first]}. "
         "The policy has not been updated with this rollout."
     )
+
+
+def as_reward(reward: Any, env: int) -> float:
+    """
+    Check a reward.
+
+    :param reward: What an environment returned
+    :param env: Which environment
+    :return: The reward
+    :raises BadData: If it is no number
+    """
+    values = np.asarray(reward)
+    if values.size != 1 or values.dtype.kind not in "biuf":
+        raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
+    return float(values.item())
 
 
 def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
@@ -112,22 +133,51 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
     :param space: The observation space
     :param obs: What an environment returned
     :param env: Which environment
-    :raises ValueError: If it is of another shape or kind
+    :raises BadData: If it is of another shape or kind, or a category that the space does not have
     """
     if isinstance(space, spaces.Dict):
-        if not isinstance(obs, dict) or obs.keys() != space.spaces.keys():
-            got = list(obs) if isinstance(obs, dict) else repr(obs)
-            raise ValueError(
+        if not isinstance(obs, Mapping) or not obs.keys() >= space.spaces.keys():
+            got = list(obs) if isinstance(obs, Mapping) else repr(obs)
+            raise BadData(
                 f"The observation of environment {env} must be a dict with keys {list(space.spaces)}, got {got}"
             )
         for key, part in space.spaces.items():
             check_observation(part, obs[key], env)
         return
-    values = np.asarray(obs)
+    try:
+        values = np.asarray(obs)
+    except ValueError as error:
+        raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
     # Integers may stand for real numbers, but numbers with a fraction not for integers
     kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
     if values.shape != space.shape or values.dtype.kind not in kinds:
-        raise ValueError(
+        raise BadData(
             f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
             f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"
         )
+    if not isinstance(space, spaces.Box) and not space.contains(values.astype(space.dtype)):
+        raise BadData(f"The observation of environment {env} must be in {space}, got {obs!r}")
+
+
+def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
+    """
+    What ``env._save_obs(i, obs)`` does, with a check.
+
+    :param env: The environments
+    :param i: Which one
+    :param obs: Its observation
+    :raises BadData: As ``check_observation``
+    """
+    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
+    if (
+        type(obs) is np.ndarray
+        and rows is not None
+        and obs.shape == rows.shape[1:]
+        and obs.dtype == rows.dtype
+        and isinstance(env.observation_space, spaces.Box)
+    ):
+        # The check in short, for the most usual case
+        rows[i] = obs
+    else:
+        check_observation(env.observation_space, obs, i)
+        DummyVecEnv._save_obs(env, i, obs)

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -20,18 +19,19 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import optimization, parameters, persistence
+from sb3_reinforce import optimization, parameters
 from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_basics, check_function, check_learn
 from sb3_reinforce.candidate_actors import LoopActor, make_actor
 from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.collection import shift_to_start
 from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
 from sb3_reinforce.guards import guarded
 from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.linear_policy import LinearPolicy
 from sb3_reinforce.normalization import frozen
+from sb3_reinforce.persistence import Persistent
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.prediction import predict
 from sb3_reinforce.search_settings import (
     check_candidates,
     check_deltas,
@@ -40,7 +40,6 @@ from sb3_reinforce.search_settings import (
     default_delta_std,
     default_n_delta,
 )
-from sb3_reinforce.storage import Place
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -49,7 +48,7 @@ class Stopped(Exception):
     """A callback returned False: ends an update from inside the estimator."""
 
 
-class FiniteDifference(BaseAlgorithm):
+class FiniteDifference(Persistent):
     """
     Search in the space of a policy's parameters, by a gradient that is estimated from returns alone.
 
@@ -104,7 +103,7 @@ class FiniteDifference(BaseAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     policy: ActorCriticPolicy
-    save, set_env, set_parameters = persistence.save, persistence.set_env, persistence.set_parameters
+    predict = predict
 
     def __init__(
         self,
@@ -217,8 +216,7 @@ class FiniteDifference(BaseAlgorithm):
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         """
-        flags = ("reset_num_timesteps", reset_num_timesteps), ("progress_bar", progress_bar)
-        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, *flags)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -387,44 +385,6 @@ class FiniteDifference(BaseAlgorithm):
         self.logger.record("time/time_elapsed", int(time_elapsed), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
-
-        :param observation: The input observation
-        :param state: Passed on; the policies are not recurrent
-        :param episode_start: Passed on
-        :param deterministic: Whether to return the most likely action instead of a sample
-        :return: The action and ``state``
-        """
-        actions, state = super().predict(observation, state, episode_start, deterministic)
-        return shift_to_start(self.action_space, actions), state
-
-    @classmethod
-    def load(
-        cls: type[SelfFiniteDifference],
-        path: Place,
-        env: GymEnv | None = None,
-        *args: Any,
-        restore_random_state: bool = False,
-        **kwargs: Any,
-    ) -> SelfFiniteDifference:
-        """
-        Load a model, see ``persistence.load``. This runs code from the file: load only what you trust.
-
-        :param path: The file
-        :param env: The environment to go on in; None for prediction alone
-        :param restore_random_state: Put the global random generators into the state that they had at ``save``
-        :return: The model
-        """
-        return persistence.load(cls, path, env, *args, restore_random_state=restore_random_state, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         mine = ["_actor_parameters", "_actor", "_candidates", "_utilities", "_observed"]

@@ -7,11 +7,12 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.environment_checks import check_finite
+from sb3_reinforce.environment_checks import BadData, check_finite, save_obs
 from sb3_reinforce.interruptions import interruptible
-from sb3_reinforce.stepping import save_obs
+from sb3_reinforce.stepping import stepper
 from sb3_reinforce.workers import watch
 
 Model = TypeVar("Model", bound=BaseAlgorithm)
@@ -31,65 +32,82 @@ def guarded(
 
     @wraps(learn)
     def run(model: Model, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with ExitStack() as stack:
-            if model.env is not None:
-                base = model.env.unwrapped
-                if isinstance(base, SubprocVecEnv):
-                    watch(base)
-                if getattr(type(base), "_save_obs", None) is DummyVecEnv._save_obs:
-                    stack.enter_context(replaced(base, _save_obs=partial(save_obs, cast(DummyVecEnv, base))))
-            vec_normalize = model.get_vec_normalize_env()
-            if vec_normalize is not None:
-                stack.enter_context(checked(vec_normalize))
-            return learn(model, *args, **kwargs)
+        with interruptible(), watched(model.env):
+            try:
+                return learn(model, *args, **kwargs)
+            except BadData as error:
+                step = (model.num_timesteps - model._num_timesteps_at_start) // model.n_envs
+                raise ValueError(
+                    f"{error} (step {step} since learn() began). The policy has not been updated with it."
+                ) from error
 
-    return interruptible(run)
+    return run
 
 
 @contextmanager
-def replaced(env: VecEnv, **methods: Callable[..., Any]) -> Iterator[None]:
+def watched(env: VecEnv | None) -> Iterator[None]:
     """
-    Give an object other methods within the block.
+    Within the block, what is malformed is refused where it comes in, and so is what is not finite, where wrappers would
+    keep it in their statistics or clip it, and so hide it.
 
-    :param env: The object
-    :param methods: The methods by name
+    :param env: The environments with all their wrappers
     """
-    before = {name: vars(env)[name] for name in methods if name in vars(env)}
-    vars(env).update(methods)
-    try:
+    base = None if env is None else env.unwrapped
+    with ExitStack() as stack:
+        if isinstance(base, SubprocVecEnv):
+            watch(base)
+        if getattr(type(base), "_save_obs", None) is DummyVecEnv._save_obs and "_save_obs" not in vars(base):
+            vars(base)["_save_obs"] = partial(save_obs, cast(DummyVecEnv, base))
+            stack.callback(vars(base).pop, "_save_obs", None)
+        wrappers = []
+        while isinstance(env, VecEnvWrapper):
+            wrappers.append(env)
+            env = env.venv
+        if wrappers and not isinstance(wrappers[-1], Guard):
+            lowest = wrappers[-1]
+            lowest.venv = Guard(lowest.venv, any(isinstance(wrapper, VecNormalize) for wrapper in wrappers))
+            stack.callback(setattr, lowest, "venv", base)
         yield
-    finally:
-        for name in methods:
-            del vars(env)[name]
-        vars(env).update(before)
 
 
-@contextmanager
-def checked(vec_normalize: VecNormalize) -> Iterator[None]:
+class Guard(VecEnvWrapper):
     """
-    Within the block, numbers that are not finite are refused before they get into the statistics, which would keep them
-    for good, or are clipped, and so hidden.
+    The lowest wrapper of environments while a model learns: names what is malformed, steps a ``DummyVecEnv`` without
+    its deep copies, and refuses numbers that are not finite.
 
-    :param vec_normalize: The wrapper
+    :param venv: The environments
+    :param has_statistics: Whether a wrapper above it keeps statistics; if not, the algorithm checks the numbers itself
     """
-    venv = vec_normalize.venv
-    reset, step_wait, n_steps = venv.reset, venv.step_wait, 0
-    check = partial(check_finite, since="since learn() began")
 
-    def checked_reset() -> Any:
-        obs = reset()
-        check("The observation", obs, (n_steps,))
+    def __init__(self, venv: VecEnv, has_statistics: bool):
+        super().__init__(venv)
+        self._has_statistics, self._step, self._guarded_actions = has_statistics, stepper(venv), np.empty(0)
+
+    def reset(self) -> VecEnvObs:
+        """Reset the environments."""
+        obs = self.venv.reset()
+        if self._has_statistics:
+            check_finite("The observation", obs, (None,))
         return obs
 
-    def checked_step_wait() -> Any:
-        nonlocal n_steps
-        obs, rewards, dones, infos = step_wait()
-        check("The reward", rewards, (n_steps,))
-        check("The observation", obs, (n_steps,))
-        for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
-            check("The terminal observation", infos[i].get("terminal_observation", 0), (n_steps, i))
-        n_steps += 1
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        Take the actions of the next step.
+
+        :param actions: Shape ``(n_envs, ...)``
+        """
+        self._guarded_actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Make the step."""
+        obs, rewards, dones, infos = self._step(self._guarded_actions)
+        if self._has_statistics:
+            check_finite("The reward", rewards, (None,))
+            check_finite("The observation", obs, (None,))
+            for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
+                check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
         return obs, rewards, dones, infos
 
-    with replaced(venv, reset=checked_reset, step_wait=checked_step_wait):
-        yield
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy of the environments is not guarded
+        return cast, (VecEnv, self.venv)

@@ -2,72 +2,85 @@
 
 import signal
 import threading
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Iterator
+from contextlib import ContextDecorator, ExitStack, contextmanager
+from functools import partial
 from types import FrameType
-from typing import Any, ParamSpec, TypeAlias, TypeVar
-
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
-Signaled: TypeAlias = tuple[int, FrameType | None]
+from typing import Any
 
 
-def interruptible(learn: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+class Uninterrupted(ContextDecorator):
+    """A block, or a function that takes little time, which is finished before Ctrl-C or SIGTERM are handled."""
+
+    depth = 0
+
+    def __init__(self) -> None:
+        self.pending: list[Callable[[], Any]] = []
+
+    def __enter__(self) -> None:
+        if in_main_thread():
+            self.depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        if not in_main_thread():
+            return
+        self.depth -= 1
+        if self.pending and not self.depth:
+            pending, self.pending = self.pending, []
+            with ExitStack() as stack:
+                # All of them, also where one raises
+                for handle in reversed(pending):
+                    stack.callback(handle)
+
+    def handle(self, handler: Callable[..., Any], number: int, frame: FrameType | None) -> None:
+        """
+        Handle a signal, now or at the end of the block.
+
+        :param handler: What handles it
+        :param number: The signal
+        :param frame: Where it came
+        """
+        if self.depth:
+            self.pending.append(partial(handler, number, frame))
+        else:
+            handler(number, frame)
+
+
+# Python handles signals in the main thread alone, so that one is enough
+uninterrupted = Uninterrupted()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
     """
-    While a function runs, SIGTERM raises a ``KeyboardInterrupt``, so that the model can still be saved.
-
-    Only in the main thread, where alone Python handles signals, and only where nobody has set a handler: by default the
-    signal would end the process at once. The default is restored afterwards.
-
-    :param learn: A function
-    :return: The same function
+    Within the block, SIGTERM raises a ``KeyboardInterrupt``, so that the model can still be saved; by default it would
+    end the process at once. Where somebody handles it otherwise, that is left so.
     """
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt(signal.Signals(number).name)
-
-    @wraps(learn)
-    def interrupted(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if not _in_main_thread() or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-            return learn(*args, **kwargs)
-        signal.signal(signal.SIGTERM, interrupt)
-        try:
-            return learn(*args, **kwargs)
-        finally:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-    return interrupted
+    own: dict[int, Any] = {}
+    for number in (signal.SIGINT, signal.SIGTERM) if in_main_thread() else ():
+        handler = before = signal.getsignal(number)
+        if number == signal.SIGTERM and before is signal.SIG_DFL:
+            handler = interrupt
+        if callable(handler):
+            own[number] = before
+            signal.signal(number, partial(uninterrupted.handle, handler))
+    try:
+        yield
+    finally:
+        for changed, before in own.items():
+            signal.signal(changed, before)
 
 
-def uninterrupted(update: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def interrupt(number: int, frame: FrameType | None) -> None:
     """
-    Let a function finish before Ctrl-C or SIGTERM are handled, so that the parameters, the optimizers and the count of
-    updates belong together.
+    Do at a signal what Python does at Ctrl-C.
 
-    :param update: A function that takes little time
-    :return: The same function
+    :param number: The signal
+    :param frame: Where it came
     """
-
-    @wraps(update)
-    def finish(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if not _in_main_thread():
-            return update(*args, **kwargs)
-        # A handler that is no function is the system's own, or one of a program in C
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        own: dict[int, Callable[..., Any]] = {number: each for number, each in handlers.items() if callable(each)}
-        pending: list[Signaled] = []
-        try:
-            for number in own:
-                signal.signal(number, lambda *signaled: pending.append(signaled))
-            return update(*args, **kwargs)
-        finally:
-            for number, handler in own.items():
-                signal.signal(number, handler)
-            for number, frame in pending[:1]:
-                own[number](number, frame)
-
-    return finish
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
-def _in_main_thread() -> bool:
+def in_main_thread() -> bool:
+    """Whether this is the thread that handles signals."""
     return threading.current_thread() is threading.main_thread()

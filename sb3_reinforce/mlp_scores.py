@@ -38,7 +38,12 @@ def factored_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
 
 
 def mlp_gradients(
-    rollout: Rollout, layers: list[th.nn.Module], parameters: Parameters, weights: tuple[th.Tensor, ...], chunk: int
+    rollout: Rollout,
+    layers: list[th.nn.Module],
+    parameters: Parameters,
+    weights: tuple[th.Tensor, ...],
+    chunk: int,
+    columns: slice,
 ) -> th.Tensor:
     """
     ``gradients_by_episode`` for a plain MLP.
@@ -48,15 +53,16 @@ def mlp_gradients(
     :param parameters: θ
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
     :param chunk: Floats that an intermediate result may take
+    :param columns: The components of θ that are kept
     :return: Shape ``(k, m, n)``
     """
     used, policy = rollout.used, rollout.policy
     rank, order = th.unique(rollout.episodes[used], return_inverse=True)[1].sort(stable=True)
     obs = select(rollout.observations, used).flatten(1).float()  # type: ignore[union-attr]
     actions = as_policy_actions(select(rollout.actions, used), policy.action_space)
-    sizes = [parameter.numel() for parameter in parameters]
+    kept = range(sum(parameter.numel() for parameter in parameters))[columns]
     w = th.stack([select(weight, used) for weight in weights]).to(parameters[0])
-    result = w.new_zeros(len(w), int(rank[-1]) + 1, sum(sizes))
+    result = w.new_zeros(len(w), int(rank[-1]) + 1, len(kept))
     widest = max(parameter.shape[0] for parameter in parameters)
     at_once = max(1, min(STEPS, chunk // (len(w) * widest)))
     for steps, ranks in zip(order.split(at_once), rank.split(at_once), strict=True):
@@ -67,7 +73,7 @@ def mlp_gradients(
             span, end = slice(end, end + length), end + length
             part = w[:, steps[span]]
             products = [weighted_sum(part, delta[span], None if x is None else x[span]) for delta, x in shares]
-            result[:, episode] += th.cat(products, dim=1)
+            result[:, episode] += th.cat(products, dim=1)[:, columns]
     return result
 
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import explained_variance, update_learning_r
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
-from sb3_reinforce import optimization, persistence
+from sb3_reinforce import optimization
 from sb3_reinforce.arguments import (
     MAX_LEARNING_RATE,
     CheckedSchedule,
@@ -29,11 +29,12 @@ from sb3_reinforce.arguments import (
     check_learn,
 )
 from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.collection import check_data, collect, shift_to_start, warn_of_own_methods
+from sb3_reinforce.collection import check_data, collect, warn_of_own_methods
 from sb3_reinforce.critic import fit_critic
 from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.guards import guarded
 from sb3_reinforce.interruptions import uninterrupted
+from sb3_reinforce.persistence import Persistent
 from sb3_reinforce.policies import (
     Parameters,
     evaluate,
@@ -41,15 +42,15 @@ from sb3_reinforce.policies import (
     set_temperature,
     split_parameters,
 )
+from sb3_reinforce.prediction import predict
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
 from sb3_reinforce.settings import check_reinforce
-from sb3_reinforce.storage import Place
 from sb3_reinforce.weighing import Running, Steps, Weighing, used_steps, weigh
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
 
-class REINFORCE(OnPolicyAlgorithm):
+class REINFORCE(Persistent, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
@@ -122,7 +123,7 @@ class REINFORCE(OnPolicyAlgorithm):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
-    save, set_env, set_parameters = persistence.save, persistence.set_env, persistence.set_parameters
+    predict = predict
 
     def __init__(
         self,
@@ -373,25 +374,6 @@ class REINFORCE(OnPolicyAlgorithm):
             return rollout.used.numel()
         return int(rollout.used.sum()) if self.normalize_by == "steps" else cast(int, self.n_episodes)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        The policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
-
-        :param observation: The input observation
-        :param state: Passed on; the policies are not recurrent
-        :param episode_start: Passed on
-        :param deterministic: Whether to return the most likely action instead of a sample
-        :return: The action and ``state``
-        """
-        actions, state = super().predict(observation, state, episode_start, deterministic)
-        return shift_to_start(self.action_space, actions), state
-
     @guarded
     def learn(
         self: SelfREINFORCE,
@@ -414,8 +396,7 @@ class REINFORCE(OnPolicyAlgorithm):
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
         """
-        flags = ("reset_num_timesteps", reset_num_timesteps), ("progress_bar", progress_bar)
-        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, *flags)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -423,25 +404,6 @@ class REINFORCE(OnPolicyAlgorithm):
         # The first rollout is drawn at the temperature of the run's start, not at that of the end of the run before
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         return total_timesteps, callback
-
-    @classmethod
-    def load(
-        cls: type[SelfREINFORCE],
-        path: Place,
-        env: GymEnv | None = None,
-        *args: Any,
-        restore_random_state: bool = False,
-        **kwargs: Any,
-    ) -> SelfREINFORCE:
-        """
-        Load a model, see ``persistence.load``. This runs code from the file: load only what you trust.
-
-        :param path: The file
-        :param env: The environment to go on in; None for prediction alone
-        :param restore_random_state: Put the global random generators into the state that they had at ``save``
-        :return: The model
-        """
-        return persistence.load(cls, path, env, *args, restore_random_state=restore_random_state, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_sorted_parameters", "_rollout"]

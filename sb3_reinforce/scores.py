@@ -54,7 +54,9 @@ class LogProb(th.nn.Module):
         return th.func.functional_call(self, by_name, (obs, actions), tie_weights=False)  # type: ignore[no-any-return]
 
 
-def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHUNK) -> th.Tensor:
+def gradients_by_episode(
+    rollout: Rollout, *weights: th.Tensor, chunk: int = CHUNK, columns: slice = slice(None)
+) -> th.Tensor:
     """
     ``Σ_t w_t ∇θ log π(a_t|s_t)`` over the used steps of each episode, for each of k weights: ``episode_gradients``
     without a backward pass an episode.
@@ -66,28 +68,33 @@ def gradients_by_episode(rollout: Rollout, *weights: th.Tensor, chunk: int = CHU
     :param rollout: The rollout, with m episodes that have used steps
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
     :param chunk: Floats that an intermediate may take besides the result; memory, not the result, depends on it
+    :param columns: The components of θ that are kept, n in number; the others cost time, and no memory
     :return: Shape ``(k, m, n)``; θ as in ``episode_gradients``
     :raises ValueError: If log π does not depend on any parameter in a way that can be differentiated
     """
     policy, used = rollout.policy, rollout.used
     parameters, layers = scored_parameters(rollout), factored_layers(policy)
     if layers is not None:
-        return mlp_gradients(rollout, layers, parameters, weights, chunk)
+        return mlp_gradients(rollout, layers, parameters, weights, chunk, columns)
     obs = select(rollout.observations, used)
     actions = as_policy_actions(select(rollout.actions, used), policy.action_space)
     episode, slots, filled = pieces_of(rollout.episodes[used])
     w = th.stack([select(weight, used) for weight in weights]).to(parameters[0])
     w = (w[:, slots] * filled.to(w)).transpose(0, 1)
-    result = w.new_zeros(len(weights), int(episode[-1]) + 1, sum(parameter.numel() for parameter in parameters))
+    n_parameters = sum(parameter.numel() for parameter in parameters)
     products_of = th.func.vmap(partial(vector_jacobian_products, LogProb(policy), parameters))
-    rows = max(1, chunk // (len(weights) * result.shape[-1]))
     try:
-        for begin in range(0, len(slots), rows):
-            part = slice(begin, begin + rows)
-            products = products_of(take(obs, slots[part]), actions[slots[part]], w[part])
-            result.index_add_(1, episode[part].to(result.device), products.transpose(0, 1))
+        # One step: an error of the policy's own comes again below, and memory cannot run out
+        products_of(take(obs, slots[:1, :1]), actions[slots[:1, :1]], w[:1, :, :1])
     except RuntimeError:
-        return th.stack([th.stack(gradients) for gradients in episode_gradients(rollout, *weights)], dim=1)
+        one_by_one = episode_gradients(rollout, *weights)
+        return th.stack([th.stack(gradients)[:, columns].clone() for gradients in one_by_one], dim=1)
+    result = w.new_zeros(len(weights), int(episode[-1]) + 1, len(range(n_parameters)[columns]))
+    rows = max(1, chunk // (len(weights) * n_parameters))
+    for begin in range(0, len(slots), rows):
+        part = slice(begin, begin + rows)
+        products = products_of(take(obs, slots[part]), actions[slots[part]], w[part])
+        result.index_add_(1, episode[part].to(result.device), products[..., columns].transpose(0, 1))
     return result
 
 

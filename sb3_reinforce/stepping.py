@@ -7,19 +7,19 @@ With 64 CartPoles these are a fourth of its time.
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
-from typing import Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
 
-from sb3_reinforce.environment_checks import check_observation
+from sb3_reinforce.environment_checks import as_reward
 
 
 def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
     """
-    How to step an environment. A subclass of ``DummyVecEnv``, or one whose methods were replaced, is asked itself.
+    How to step an environment. A subclass of ``DummyVecEnv``, or one on which a method for stepping was replaced, is
+    asked itself.
 
     :param env: The environments
     :return: A function of actions of shape ``(n_envs, ...)``
@@ -37,44 +37,22 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
 
     :param env: The environments
     :param actions: Shape ``(n_envs, ...)``
-    :raises ValueError: If an observation or a reward is malformed
+    :raises BadData: If a reward is no number
     """
-    rewards, dones, infos = np.empty(env.num_envs, dtype=np.float32), np.empty(env.num_envs, dtype=bool), []
+    env.step_async(actions)
+    infos = []
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
+        env.buf_rews[i] = reward if type(reward) is float else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
-        dones[i] = terminated or truncated
+        env.buf_dones[i] = terminated or truncated
         if terminated or truncated:
+            env._save_obs(i, obs)
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        save_obs(env, i, obs)
-        try:
-            rewards[i] = reward
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"The reward of environment {i} must be a number, got {reward!r}") from error
+        env._save_obs(i, obs)
         infos.append(info)
+    env.buf_infos = infos
     rows = {key: part.copy() for key, part in env.buf_obs.items()}
-    return dict_to_obs(env.observation_space, rows), rewards, dones, infos
-
-
-def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
-    """
-    What ``env._save_obs(i, obs)`` does, refusing what it would broadcast or cast to another kind without a word.
-
-    :param env: The environments
-    :param i: Which one
-    :param obs: Its observation
-    :raises ValueError: If the observation is malformed
-    """
-    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
-    if (
-        type(obs) is np.ndarray
-        and rows is not None
-        and obs.shape == rows.shape[1:]
-        and obs.dtype.kind == rows.dtype.kind
-    ):
-        rows[i] = obs
-        return
-    check_observation(env.observation_space, obs, i)
-    DummyVecEnv._save_obs(env, i, obs)
+    return dict_to_obs(env.observation_space, rows), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()

@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, and checked before they are read."""
 
 import io
+import json
 import os
 import warnings
 import zipfile
@@ -8,7 +9,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 from uuid import uuid4
 
 from stable_baselines3.common.save_util import open_path
@@ -22,17 +23,18 @@ def whole_or_not_at_all(place: Place) -> Iterator[io.BytesIO]:
     A buffer to write to, which replaces a file at the end of the block, in one step.
 
     If anything fails, within the block or with the disk, the file is as it was and nothing else is left. That holds for
-    a killed process too, but where the file system has no files without a name (O_TMPFILE, which Linux has): there a
-    ``.NAME.*.tmp`` is left if the process is killed in the moment of writing.
+    a killed process too, but where the system has no files without a name (O_TMPFILE, which Linux has): there a
+    ``.*.tmp`` is left if the process is killed in the moment of writing.
 
     :param place: A path, to which ``.zip`` is added where it has no suffix, or a file opened for writing
     """
-    file = None if isinstance(place, (str, Path)) else open_path(place, "w")
     buffer = io.BytesIO()
-    yield buffer
-    if file is None:
-        replace(path_of(Path(cast(Any, place))), buffer.getvalue())
+    if isinstance(place, (str, Path)):
+        yield buffer
+        replace(path_of(Path(place)), buffer.getvalue())
     else:
+        file = open_path(place, "w")
+        yield buffer
         file.write(buffer.getvalue())
 
 
@@ -55,34 +57,39 @@ def replace(path: Path, content: bytes) -> None:
     """
     Replace a file, so that at each moment either the old one or the new one is there, whole.
 
-    :param path: The file; it need not exist
+    :param path: The file; it need not exist. Its permissions are kept
     :param content: The new content
     :raises OSError: If it cannot be written; the old file is then still there
     """
-    beside = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
+    beside = path.with_name(f".{uuid4().hex}.tmp")
     try:
-        with open(create(beside), "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-            if not beside.exists():
+        try:
+            # A file without a name vanishes with its process
+            with open(os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666), "wb") as file:
+                write(file, content, path)
                 give_name(file.fileno(), beside)
+        except (AttributeError, OSError):
+            with open(beside, "xb") as file:
+                write(file, content, path)
         os.replace(beside, path)
     finally:
         with suppress(FileNotFoundError):
             beside.unlink()
 
 
-def create(path: Path) -> int:
+def write(file: Any, content: bytes, path: Path) -> None:
     """
-    Open a new file for writing: one without a name where the system has such, which vanishes with its process.
+    Write a new file, onto the disk, with the permissions of the one that it is to replace.
 
-    :param path: Its name, if it must have one
-    :return: The file descriptor
+    :param file: The new file
+    :param content: Its content
+    :param path: The old file; it need not exist
     """
-    with suppress(AttributeError, OSError):
-        return os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666)
-    return os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    if path.exists() and hasattr(os, "fchmod"):
+        os.fchmod(file.fileno(), path.stat().st_mode & 0o7777)
+    file.write(content)
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def give_name(descriptor: int, path: Path) -> None:
@@ -100,20 +107,22 @@ def give_name(descriptor: int, path: Path) -> None:
         os.close(folder)
 
 
-def check_archive(place: Place, needed: tuple[str, ...]) -> None:
+def check_archive(place: Place, needed: tuple[str, ...]) -> set[str]:
     """
     Check a saved model before anything of it is used: every part is there, and each has the checksum it was saved with.
 
     :param place: A path or an open file
     :param needed: Names of parts that must be there
+    :return: The names of the attributes in it
     :raises ValueError: If it is not a saved model, or a damaged one
     """
     file: Any = open_path(place, "r", suffix="zip")
     begin = file.tell()
     try:
         with zipfile.ZipFile(file) as archive:
-            missing = [name for name in needed if name not in archive.namelist()]
+            parts = archive.namelist()
             damaged = archive.testzip()
+            attributes = set() if damaged or "data" not in parts else set(json.loads(archive.read("data")))
     # What zipfile raises where bytes that it relies on are others than they were
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, zlib.error) as error:
         raise ValueError(f"{place} is damaged, or not a saved model: {error}") from error
@@ -124,5 +133,7 @@ def check_archive(place: Place, needed: tuple[str, ...]) -> None:
             file.seek(begin)
     if damaged is not None:
         raise ValueError(f"{place} is damaged: the checksum of its part {damaged!r} is wrong")
+    missing = [name for name in needed if name not in parts]
     if missing:
         raise ValueError(f"{place} is not a saved model, or not a whole one: it has no {', '.join(missing)}")
+    return attributes

@@ -11,36 +11,67 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_reinforce.environment_checks import as_reward, check_observation
+from sb3_reinforce.interruptions import uninterrupted
+
 
 class Watched:
     """
     The learner's end of the pipe to a worker, which raises an error when the worker has died.
 
     A plain one may never return: with ``start_method="fork"`` the other workers hold the dead one's end of the pipe
-    open.
+    open. Nor does it know whether an answer is that to an earlier question, which Ctrl-C has left in the pipe.
 
     :param remote: The plain end of the pipe
     :param process: The worker
     :param env: The number of its environment
+    :param space: The observation space
     :param note: A file in which the worker tells about its end
     """
 
-    def __init__(self, remote: Any, process: Any, env: int, note: Path):
-        self.remote, self.process, self.env, self.note = remote, process, env, note
+    def __init__(self, remote: Any, process: Any, env: int, space: Any, note: Path):
+        self.remote, self.process, self.env, self.space, self.note = remote, process, env, space, note
+        self.question = ""
 
-    def send(self, message: Any) -> None:
+    def send(self, message: tuple[str, Any]) -> None:
         """
-        Send a message to the worker.
+        Send a question to the worker.
 
-        :param message: Anything that can be pickled
-        :raises ConnectionError: If the worker is dead
+        :param message: The question and its data
+        :raises ConnectionError: If the worker is dead and is asked for more than its end
         """
+        if self.question:
+            self.answer()
+        is_last = message[0] == "close"
         try:
-            self.remote.send(message)
+            with uninterrupted:
+                self.remote.send(message)
+                self.question = "" if is_last else message[0]
         except ConnectionError as error:
-            raise self.died() from error
+            if not is_last:
+                raise self.died() from error
 
     def recv(self) -> Any:
+        """
+        What the worker answers; None where it has not been asked, as by ``close`` after a step that was broken off.
+
+        :raises BadData: If what the environment returned is malformed
+        :raises ConnectionError: If it dies instead
+        """
+        question = self.question
+        if not question:
+            return None
+        answer = self.answer()
+        if question in ("step", "reset"):
+            check_observation(self.space, answer[0], self.env)
+        if question == "step":
+            _, reward, done, info, _ = answer
+            as_reward(reward, self.env)
+            if done:
+                check_observation(self.space, info["terminal_observation"], self.env)
+        return answer
+
+    def answer(self) -> Any:
         """
         What the worker answers.
 
@@ -49,8 +80,12 @@ class Watched:
         try:
             if self.remote not in wait([self.remote, self.process.sentinel]):
                 raise EOFError
-            return self.remote.recv()
+            with uninterrupted:
+                answer = self.remote.recv()
+                self.question = ""
+            return answer
         except (EOFError, ConnectionError) as error:
+            self.question = ""
             raise self.died() from error
 
     def died(self) -> ConnectionError:
@@ -70,21 +105,17 @@ class Watched:
         return getattr(self.remote, name)
 
 
-class Question(str):
+class NoteLastException:
     """
-    The name of an attribute, to ask a worker for. As soon as the worker has read it, it will note its last exception.
+    As soon as a worker has read it, it will note its last exception.
 
     Only so can this be asked for: the worker of a ``SubprocVecEnv`` prints its exception and closes the pipe.
 
     :param note: The file to note it in
     """
 
-    def __new__(cls, note: Path) -> "Question":
-        question = super().__new__(cls, "unwrapped")
-        question.note = note
-        return question
-
-    note: Path
+    def __init__(self, note: Path):
+        self.note = note
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
         return note_last_exception, (self.note,)
@@ -120,9 +151,11 @@ def watch(env: SubprocVecEnv) -> None:
         return
     notes = mkdtemp(prefix="sb3_reinforce_")
     weakref.finalize(env, shutil.rmtree, notes, ignore_errors=True)
-    ends = enumerate(zip(workers.remotes, workers.processes, strict=True))
-    workers.remotes = tuple(Watched(remote, process, i, Path(notes, str(i))) for i, (remote, process) in ends)
+    workers.remotes = tuple(
+        Watched(remote, process, i, env.observation_space, Path(notes, str(i)))
+        for i, (remote, process) in enumerate(zip(workers.remotes, workers.processes, strict=True))
+    )
     for remote in workers.remotes:
-        remote.send(("has_attr", Question(remote.note)))
+        remote.send(("has_attr", NoteLastException(remote.note)))
     for remote in workers.remotes:
         remote.recv()

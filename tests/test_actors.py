@@ -6,7 +6,9 @@ import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
+from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
@@ -102,6 +104,25 @@ class OwnLatent(ActorCriticPolicy):
         return super()._get_action_dist_from_latent(latent_pi * -20)
 
 
+class OwnDistribution(ActorCriticPolicy):
+    def get_distribution(self, obs):
+        return self.action_dist.proba_distribution(super().get_distribution(obs).distribution.logits * -20)
+
+    def evaluate_actions(self, obs, actions):
+        distribution = self.get_distribution(obs)
+        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+
+
+class OwnExtractor(FlattenExtractor):
+    def forward(self, observations):
+        return super().forward(observations) * -20
+
+
+class OwnMlp(MlpExtractor):
+    def forward_actor(self, features):
+        return super().forward_actor(features) * -20
+
+
 class OwnFeatures(ActorCriticPolicy):
     def extract_features(self, obs, features_extractor=None):
         return super().extract_features(obs, features_extractor) * -20
@@ -134,6 +155,9 @@ CHANGES = {
     "as it is": lambda policy: None,
     "class": lambda policy: setattr(policy, "__class__", OwnLatent),
     "features": lambda policy: setattr(policy, "__class__", OwnFeatures),
+    "distribution of the class": lambda policy: setattr(policy, "__class__", OwnDistribution),
+    "extractor": lambda policy: setattr(policy.features_extractor, "__class__", OwnExtractor),
+    "mlp extractor": lambda policy: setattr(policy.mlp_extractor, "__class__", OwnMlp),
     "method": own_method,
     "distribution": lambda policy: setattr(policy, "action_dist", Certain(2)),
     "hook on the head": lambda policy: scale(policy.action_net),
@@ -174,6 +198,12 @@ def test_whatever_is_not_plain_goes_the_general_way():
     assert actor_layers(make_policy(SPACES[3], use_sde=True)) is None
     assert actor_layers(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
     assert actor_layers(th.compile(make_policy(), backend="eager")) is None
+
+
+def test_images_go_the_general_way():
+    """They are scaled to [0, 1] before they are flattened."""
+    model = REINFORCE("MlpPolicy", FakeImageEnv(screen_height=36, screen_width=36), device="cpu")
+    assert type(model.policy.features_extractor) is FlattenExtractor and actor_layers(model.policy) is None
 
 
 def test_a_squashed_gaussian_is_squashed():

@@ -7,15 +7,26 @@ import numpy as np
 import pytest
 import torch as th
 from environments import Corridor, Tree
+from gymnasium import spaces
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.baselines import BASELINES
-from sb3_reinforce.diagnostics import compare_baselines, gradient_statistics, gradients_by_episode, sample
-from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals
+from sb3_reinforce.diagnostics import (
+    GradientQualityCallback,
+    baseline_gradients,
+    compare_baselines,
+    compare_estimators,
+    gradient_statistics,
+    gradients_by_episode,
+    sample,
+)
+from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals, gradient_blocks
 from sb3_reinforce.scores import episode_gradients
+
+BOX = spaces.Box(-1, 1, (1,))
 
 
 class GaussianBandit(Corridor):
@@ -147,16 +158,36 @@ def test_the_floor_is_the_best_constant_of_each_component():
 
 def test_rows_are_the_variances_of_the_gradients_themselves():
     model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 3, seed=1), seed=1, device="cpu")
-    th.manual_seed(0)
     model.env.seed(7)
-    table = compare_baselines(model, 12)
-    th.manual_seed(0)
+    table = compare_baselines(model, 12, seed=5)
+    th.manual_seed(5)
     model.env.seed(7)
     rollout = sample(model, 12)
     for name, baseline in BASELINES.items():
         weights = rollout.discounts * (rollout.returns - baseline(rollout))
         gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
         assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("floats", [1, 5000, 2**26])
+def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeypatch, floats):
+    env = make_vec_env("CartPole-v1", 3, seed=1)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": [5]}, seed=1, device="cpu")
+    rollout = sample(model, 6)
+    baselines = {name: function(rollout) for name, function in BASELINES.items() if name != "optimal"}
+    sizes = []
+
+    def blocks(*args):
+        for block in gradient_blocks(*args, floats=floats):
+            sizes.append(block.numel())
+            yield block
+
+    monkeypatch.setattr(baseline_gradients, "gradient_blocks", blocks)
+    found, _ = baseline_gradients.grams(rollout, baselines)
+    assert max(sizes) <= max(floats, 5 * 6)
+    for name, function in BASELINES.items():
+        gradients = gradients_by_episode(rollout, rollout.returns - function(rollout))[0].double()
+        th.testing.assert_close(found[name], gradients @ gradients.T, rtol=1e-4, atol=1e-4 * float(found[name].max()))
 
 
 def test_time_or_state_halve_the_variance_on_cartpole():
@@ -189,8 +220,29 @@ def test_the_model_is_as_it_was_and_goes_on():
     assert model.num_timesteps == 32
 
 
+def test_the_model_knows_that_an_episode_begins():
+    """Left in the middle of one, with the flags of the last step, its next rollout would go on counting."""
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=7, device="cpu").learn(7)
+    assert not model._last_episode_starts.all()
+    rollout = sample(model, 3)
+    assert model._last_episode_starts.all()
+    assert rollout.timesteps[:, 0].tolist() == [*range(5)] * 3
+    model.learn(7, reset_num_timesteps=False)
+    assert model._rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
+
+
 def half(rollout):
     return rollout.returns * 0 + 0.5
+
+
+def called(name):
+    """A function of that name."""
+
+    def function(rollout):
+        return half(rollout)
+
+    function.__name__ = name
+    return function
 
 
 def test_a_users_function_is_a_row_and_the_table_prints():
@@ -224,6 +276,11 @@ def test_a_table_becomes_a_data_frame():
         ({"n_episodes": 2}, "n_episodes must be at least 3, got 2"),
         ({"n_episodes": 10.0}, "n_episodes must be an integer"),
         ({"baselines": ("median",)}, r"baselines must be.*'time_mean'.*got 'median'"),
+        ({"baselines": 3}, "baselines must be a name or a callable, got 3"),
+        ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "two of its functions are named '<lambda>'"),
+        ({"baselines": called("none")}, "named 'none'"),
+        ({"baselines": called("floor")}, "a function named 'floor', which is the name of a row"),
+        ({"baselines": called("optimal")}, "a function named 'optimal', which is the name of a row"),
         ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
         ({"baselines": ("value",)}, "no critic.*'none'"),
         ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
@@ -243,6 +300,25 @@ def test_other_models_are_refused():
     model.env = None
     with pytest.raises(ValueError, match="set_env"):
         compare_baselines(model)
+
+
+def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
+    model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, device="cpu")
+    for measure in (compare_baselines, compare_estimators, lambda m: m.learn(64, GradientQualityCallback(1))):
+        with pytest.raises(ValueError, match="use_sde=True and sde_sample_freq=-1"):
+            measure(model)
+
+
+def test_with_new_noise_at_each_step_they_are():
+    """The mean of 20 episodes varies over repetitions as their own variance says, tr Σ / 20."""
+    model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, sde_sample_freq=1, device="cpu", seed=0)
+    table = compare_baselines(model, 400, ["none"], n_resamples=10)
+    means = []
+    for _ in range(60):
+        rollout = sample(model, 20)
+        means.append(gradients_by_episode(rollout, rollout.returns)[0].double().mean(0))
+    between = gradient_statistics(th.stack(means), confidence=0.999).variance
+    assert between.low < table["none"].variance.value / 20 < between.high
 
 
 def test_gradients_by_episode_is_public():

@@ -8,8 +8,9 @@ import torch as th
 from environments import Corridor, Tree
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
@@ -52,6 +53,15 @@ def test_every_action_space_passes(action_space, kwargs):
 def test_other_policies_and_arguments_pass(policy, env, kwargs):
     table = check_gradient(REINFORCE(policy, env, device="cpu", seed=0, **kwargs))
     assert table.passed, table
+
+
+def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
+    env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=1, discrete=True)
+    seen, forward = [], NatureCNN.forward
+    monkeypatch.setattr(NatureCNN, "forward", lambda self, obs: seen.append(len(obs)) or forward(self, obs))
+    table = check_gradient(REINFORCE("CnnPolicy", env, baseline="none", n_episodes=2, device="cpu", seed=0), 2)
+    assert table.passed, table
+    assert max(seen) <= 2**21 // 84**2
 
 
 def test_gsde_cuts_its_scores_unless_it_learns_features():
@@ -160,6 +170,16 @@ def test_negation_is_seen_in_every_action_space():
     for action_space in ACTION_SPACES:
         model = REINFORCE(Negated, corridor(action_space), baseline="none", device="cpu", seed=0)
         assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", Negated])
+def test_a_policy_without_randomness_does_not_pass_unchecked(policy):
+    model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
+    with th.no_grad():
+        model.policy.action_net.bias.copy_(th.tensor([80.0, 0.0, 0.0]))
+    table = check_gradient(model)
+    assert np.isnan(table["sign"].error)
+    assert "sign" in table.failures
 
 
 def test_returns_by_definition_are_the_recursive_ones():

@@ -2,20 +2,17 @@
 
 from itertools import product
 
+import numpy as np
 import pytest
 import torch as th
 from environments import Tree
 from test_enumeration import LOGITS, episode_terms, log_pi
 
 from sb3_reinforce.diagnostics.bootstrap import interval, resamples
-from sb3_reinforce.diagnostics.gradient_statistics import (
-    Moments,
-    gradient_statistics,
-    moments,
-    noise_scale,
-    signal_to_noise,
-    variance,
-)
+from sb3_reinforce.diagnostics.estimator_comparison import estimator_row
+from sb3_reinforce.diagnostics.gradient_statistics import gradient_statistics
+from sb3_reinforce.diagnostics.moments import Moments, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.tables import as_text
 
 MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
 FACTOR = th.randn(8, 8, dtype=th.float64, generator=th.Generator().manual_seed(3))
@@ -41,7 +38,16 @@ def test_counts_are_repeated_samples_without_their_pairs_with_themselves():
     labels = [0, 0, 0, 2, 2, 3]
     pairs = [gradients[i] @ gradients[j] for i, j in product(labels, repeat=2) if i != j]
     th.testing.assert_close(found.signal[0], th.stack(pairs).mean())
-    th.testing.assert_close(found.second[0], gradients[labels].square().sum(1).mean())
+    apart = [(gradients[i] - gradients[j]).square().sum() / 2 for i, j in product(labels, repeat=2) if i != j]
+    th.testing.assert_close(variance(found)[0], th.stack(apart).mean())
+
+
+def test_no_resample_has_a_negative_variance():
+    """Three times 1 and once 2: half the squared distance of the only pair that differs, whatever the counts."""
+    gradients, counts = th.tensor([[1.0], [2.0]]).double(), th.tensor([[3.0, 1.0], [1.0, 1.0]]).double()
+    assert variance(moments(gradients @ gradients.T, counts)).tolist() == [0.5, 0.5]
+    found = gradient_statistics(draw(3, th.Generator().manual_seed(0)), n_resamples=2000)
+    assert found.variance.low > 0
 
 
 def test_variance_and_signal_are_unbiased_on_the_tree():
@@ -87,6 +93,42 @@ def test_95_percent_intervals_cover_the_truth_in_90_to_98_percent_of_500_repetit
     assert ((0.90 <= covered / 500) & (covered / 500 <= 0.98)).all(), covered / 500
 
 
+@pytest.mark.parametrize(("m", "scale"), [(10, 0.2), (32, 0.2), (10, 0.5), (20, 1.0)])
+def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same(m, scale):
+    """Signal-to-noise ratios of the mean from 0.08 to 4; the reference is as noisy where it is made of samples too."""
+    generator, covered, both = th.Generator().manual_seed(0), 0, 0
+    reference = th.ones(8, dtype=th.float64) + MEAN
+    truth = float(MEAN @ reference / MEAN.norm() / reference.norm())
+    shift = (scale - 1) * MEAN
+    for seed in range(500):
+        gradients, others = draw(m, generator) + shift, draw(m, generator) + shift + scale * th.ones(8)
+        found = gradient_statistics(gradients, reference, n_resamples=200, seed=seed).cosine
+        covered += found.low <= truth <= found.high
+        counts, other_counts = resamples(m, 200, seed), resamples(m, 200, seed + 1000)
+        found = estimator_row("", gradients, others, 1, 1, counts, other_counts, 0.95).cosine
+        both += found.low <= truth <= found.high
+    assert min(covered, both) >= 450, (covered, both)
+
+
+def test_without_a_signal_the_cosine_is_not_known():
+    gradients, reference = th.tensor([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]), th.tensor([1.0, 0.0])
+    found = gradient_statistics(gradients, reference).cosine
+    assert found.value != found.value
+    assert (found.low, found.high) == (-1, 1)
+    assert as_text(found) == "-"
+
+
+def test_the_noise_of_the_reference_does_not_lower_the_cosine():
+    """With the norm of the mean of 40 noisy samples it would be too small by a factor near √(1 / 1.13) = 0.94."""
+    generator, shift = th.Generator().manual_seed(2), th.tensor([1.0, 1, 1, 1, 0, 0, 0, 0], dtype=th.float64)
+    truth = float(MEAN @ (MEAN + shift) / MEAN.norm() / (MEAN + shift).norm())
+    counts, values = (resamples(400, 1, 0), resamples(40, 1, 0)), []
+    for _ in range(400):
+        gradients, reference = draw(400, generator), draw(40, generator) + shift
+        values.append(estimator_row("", gradients, reference, 1, 1, *counts, 0.95).cosine.value)
+    assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
+
+
 def test_many_samples_give_the_closed_forms():
     found = gradient_statistics(draw(4000, th.Generator().manual_seed(5)), MEAN, n_resamples=10)
     assert found.variance.value == pytest.approx(TRACE, rel=0.05)
@@ -111,6 +153,7 @@ def test_an_interval_holds_its_estimate_and_can_be_infinite():
         ([[1.0], [2.0]], {}, "must be a tensor"),
         (th.ones(2, 3), {"reference": th.ones(2)}, r"reference.*\(2,\)"),
         (th.ones(2, 3), {"reference": th.zeros(3)}, r"reference.*norm 0"),
+        (th.ones(2, 3), {"reference": [1.0, 1.0, 1.0]}, "reference must be a tensor"),
         (th.ones(2, 3), {"confidence": 95}, "confidence"),
         (th.ones(2, 3), {"n_resamples": 0}, "n_resamples"),
     ],

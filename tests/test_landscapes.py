@@ -10,8 +10,8 @@ from test_enumeration import make_model, true_gradient
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
-from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
+from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
 
 
 def bandit(algorithm=REINFORCE, **kwargs):
@@ -66,13 +66,51 @@ def test_all_estimators_see_the_same_gradient(algorithm):
         ({"estimators": ("backward",)}, r"estimators must be one of.*'backward'"),
         ({"delta_std": 0.0}, "delta_std"),
         ({"n_delta": 1}, "n_delta must be at least 2"),
+        ({"estimators": "backward"}, "estimators must be one of.*'backward'"),
+        ({"estimators": ()}, "estimators must be one of"),
         ({"perturbation": "cube"}, "perturbation must be"),
         ({"confidence": 95}, "confidence"),
     ],
 )
-def test_a_users_mistake_is_named(kwargs, message):
+def test_a_users_mistake_is_named_before_anything_is_sampled(kwargs, message):
+    model = bandit()
+    model.env.reset = None
     with pytest.raises((ValueError, TypeError), match=message):
-        compare_estimators(bandit(), **kwargs)
+        compare_estimators(model, **kwargs)
+
+
+def test_by_default_every_estimator_sees_something_on_cartpole():
+    env = make_vec_env("CartPole-v1", 8, seed=0)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": {"pi": [], "vf": [64]}}, device="cpu", seed=0)
+    for row in compare_estimators(model):
+        assert row.snr_per_step.low > 0, row
+        assert row.cosine.low > 0, row
+
+
+def test_a_single_name_is_an_estimator():
+    assert compare_estimators(bandit(), 10, 3, "central").names == ["central"]
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_seed_makes_it_reproducible_and_leaves_the_generator_and_the_mode(training):
+    """A task whose episodes are drawn by the environment's own generator, and actions by PyTorch's."""
+    env = make_vec_env(lambda: Corridor((1, 2, 5), lambda t, action: float(action)), 4, seed=0)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+    model.policy.set_training_mode(training)
+
+    def figures(seed):
+        rows = compare_estimators(model, 12, 4, n_resamples=20, seed=seed).to_records()
+        return [{key: x for key, x in row.items() if key != "seconds"} for row in rows]
+
+    before = th.get_rng_state()
+    first = figures(3)
+    np.testing.assert_equal(figures(3), first)
+    assert figures(4)[0]["snr_per_step"] != first[0]["snr_per_step"]
+    utilities = [landscape(model, n_points=2, seed=1).utilities for _ in range(2)]
+    np.testing.assert_equal(*utilities)
+    compare_baselines(model, 5, n_resamples=2)
+    assert th.equal(th.get_rng_state(), before)
+    assert model.policy.training == training
 
 
 def test_other_models_are_refused():
@@ -111,11 +149,16 @@ def test_directions_are_normalized_filter_by_filter():
         ({"n_episodes": 0}, "n_episodes"),
         ({"directions": th.ones(2, 3)}, r"directions.*\(2, 4\).*\(2, 3\)"),
         ({"gradients": {"g": th.zeros(4)}}, r"gradients\['g'\].*not zero"),
+        ({"gradients": {"g": [1.0, 2.0]}}, r"gradients\['g'\] must be a tensor, got \[1.0, 2.0\]"),
+        ({"gradients": th.ones(4)}, "gradients must be a dictionary.*Tensor"),
+        ({"directions": [1.0, 2.0]}, "directions must be a tensor"),
     ],
 )
-def test_a_wrong_plane_is_named(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        landscape(bandit(), **kwargs)
+def test_a_wrong_plane_is_named_before_it_is_evaluated(kwargs, message):
+    model = bandit()
+    model.env.reset = None
+    with pytest.raises((ValueError, TypeError), match=message):
+        landscape(model, **kwargs)
 
 
 plots = pytest.importorskip("matplotlib") and pytest.importorskip("sb3_reinforce.plots")

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import PitfallCallback
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
+from sb3_reinforce.diagnostics.updates import Seen, Update
 
 
 def noise(t, action):
@@ -34,8 +35,7 @@ class Jackpot(Corridor):
 
 def fall(env, timesteps, change=None, n_envs=1, **kwargs):
     """What was found, in a run on which every warning is a sentence of the callback or of the rollout."""
-    if not isinstance(env, str):
-        env = make_vec_env(env, n_envs, seed=0)
+    env = make_vec_env(env, n_envs, seed=0)
     model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", **kwargs)
     if change is not None:
         with th.no_grad():
@@ -52,7 +52,7 @@ def fall(env, timesteps, change=None, n_envs=1, **kwargs):
 @pytest.mark.parametrize(
     ("name", "argument", "env", "timesteps", "kwargs"),
     [
-        ("rate_too_large", "learning_rate=1.0", "CartPole-v1", 2000, {"learning_rate": 1.0}),
+        ("rate_too_large", "learning rate, now 1", "CartPole-v1", 2000, {"learning_rate": 1.0}),
         ("unscaled_returns", "VecNormalize", lambda: Corridor((5,), lambda t, action: 5e3), 64, {}),
         ("too_few_episodes", "n_episodes", lambda: Corridor((4,), noise), 400, {"n_episodes": 1, "baseline": "none"}),
         (
@@ -99,6 +99,113 @@ def test_a_task_made_for_it_falls_into_the_pitfall(name, argument, env, timestep
     assert argument in found[name]
 
 
+def seen(updates=(), n_updates=100, progress=1.0, **kwargs):
+    """What a model with these arguments has seen: updates that differ from a healthy one in some figures."""
+    model = REINFORCE("MlpPolicy", kwargs.pop("env", "CartPole-v1"), device="cpu", **kwargs)
+    model._current_progress_remaining = progress
+    generator = th.Generator().manual_seed(0)
+    healthy = {
+        "kl": 0.01,
+        "entropy": 0.6,
+        "std": 0.5,
+        "grad_norm": 1.0,
+        "explained_variance": 0.5,
+        "return_scale": 10.0,
+        "return_std": 5.0,
+        "n_episodes": 16,
+        "n_steps": 256,
+        "used_fraction": 1.0,
+    }
+    return Seen(
+        model,
+        [Update(gradient=th.randn(30, generator=generator), **{**healthy, **figures}) for figures in updates],
+        n_updates,
+    )
+
+
+def signal(strength):
+    """50 updates of 4 episodes whose gradients have a signal-to-noise ratio."""
+    found = seen([{"n_episodes": 4}] * 50, n_episodes=4, baseline="none")
+    for update in found.updates:
+        update.gradient.add_(strength**0.5)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "falls", "stays"),
+    [
+        ("rate_too_large", lambda: seen([{"kl": 0.2}] * 10), lambda: seen([{"kl": 0.2}] * 9)),
+        ("rate_too_large", lambda: seen([{"kl": 0.01}, {"kl": 1.5}]), lambda: seen([{"kl": 1.5}, {"kl": 0.01}])),
+        (
+            "rate_too_large",
+            lambda: seen([{"entropy": 0.69}] + [{"entropy": 0.2}] * 9),
+            lambda: seen([{"entropy": 0.69}] + [{"entropy": 0.2}] * 10),
+        ),
+        (
+            "unscaled_returns",
+            lambda: seen([{"return_scale": 2e3}]),
+            lambda: seen([{"return_scale": 2e3}], normalize_advantage=True),
+        ),
+        ("too_few_episodes", lambda: signal(0.0), lambda: signal(0.3)),
+        ("too_few_episodes", lambda: seen([{"n_steps": 20}] * 50), lambda: seen([{}] * 50)),
+        ("too_few_episodes", lambda: seen([{"n_episodes": 4}] * 50), lambda: seen([{"n_episodes": 4}] * 49)),
+        (
+            "spikes_without_clipping",
+            lambda: seen([{}] * 20 + [{"grad_norm": 11.0}], max_grad_norm=None),
+            lambda: seen([{}] * 20 + [{"grad_norm": 11.0}], max_grad_norm=0.5),
+        ),
+        (
+            "useless_critic",
+            lambda: seen([{"explained_variance": -0.1}] * 50, progress=0.4),
+            lambda: seen([{"explained_variance": -0.1}] * 50, progress=0.6),
+        ),
+        (
+            "useless_critic",
+            lambda: seen([{"explained_variance": 0.0, "return_std": 1.1}] * 50, progress=0.4),
+            lambda: seen([{"explained_variance": 0.0, "return_std": 0.9}] * 50, progress=0.4),
+        ),
+        (
+            "deterministic_too_early",
+            lambda: seen([{"entropy": 0.01}], progress=0.6),
+            lambda: seen([{"entropy": 0.01}], progress=0.5),
+        ),
+        (
+            "cut_episodes",
+            lambda: seen([{"used_fraction": 0.89}], n_steps=32, baseline="mean"),
+            lambda: seen([{"used_fraction": 0.91}], n_steps=32, baseline="mean"),
+        ),
+        (
+            "cut_episodes",
+            lambda: seen([{"used_fraction": 0.5}], n_steps=32, baseline="mean"),
+            lambda: seen([{"used_fraction": 0.5}], n_steps=32, baseline="value"),
+        ),
+    ],
+)
+def test_a_pitfall_begins_where_it_is_said_to(name, falls, stays):
+    assert PITFALLS[name](falls()) is not None
+    assert PITFALLS[name](stays()) is None
+
+
+def test_batches_as_small_as_those_of_a2c_are_found():
+    found = fall("CartPole-v1", 2000, n_envs=4, n_steps=5)
+    assert "n_steps, or the number of environments" in found["too_few_episodes"]
+
+
+def test_small_noise_weights_are_not_a_deterministic_policy():
+    """With gSDE the standard deviation of the action is that of the weights times the norm of the features."""
+    kwargs = {"log_std_init": -3.0, "net_arch": [256]}
+    found = fall("Pendulum-v1", 1000, use_sde=True, policy_kwargs=kwargs, normalize_advantage=True)
+    assert "deterministic_too_early" not in found
+    found = fall("Pendulum-v1", 1000, use_sde=True, policy_kwargs={"log_std_init": -9.0}, normalize_advantage=True)
+    assert "deterministic_too_early" in found
+
+
+def test_a_schedule_is_told_by_its_present_value():
+    found = fall("CartPole-v1", 500, learning_rate=lambda progress: progress, ent_coef=lambda progress: 0.0)
+    assert "learning rate, now 0." in found["rate_too_large"] or "learning rate, now 1" in found["rate_too_large"]
+    assert "<function" not in "".join(found.values())
+
+
 def test_every_pitfall_has_a_task():
     tested = {case[0] for case in test_a_task_made_for_it_falls_into_the_pitfall.pytestmark[0].args[1]}
     assert tested == set(PITFALLS)
@@ -116,20 +223,19 @@ def healthy(env, timesteps, normalize=False, **kwargs):
     )
     callback = PitfallCallback()
     model.learn(timesteps, callback)
-    assert callback.found == {}
-    assert callback.n_updates == model._n_updates
-    return model
+    return callback.found, callback.n_updates - model._n_updates
 
 
 def test_nothing_is_said_of_a_healthy_run():
-    healthy("CartPole-v1", 15_000)
-    healthy("Pendulum-v1", 15_000, normalize=True, gamma=0.9)
+    """Every update was looked at, and no pitfall found."""
+    assert healthy("CartPole-v1", 15_000) == ({}, 0)
+    assert healthy("Pendulum-v1", 15_000, normalize=True, gamma=0.9) == ({}, 0)
 
 
 @pytest.mark.slow
 def test_nothing_is_said_of_long_healthy_runs():
-    healthy("CartPole-v1", 60_000)
-    healthy("Pendulum-v1", 100_000, normalize=True, gamma=0.9)
+    assert healthy("CartPole-v1", 60_000) == ({}, 0)
+    assert healthy("Pendulum-v1", 100_000, normalize=True, gamma=0.9) == ({}, 0)
 
 
 @pytest.mark.slow
@@ -139,7 +245,7 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
         # Box2D is not there, or warns where it is imported, and an error there would not be caught
         warnings.simplefilter("ignore")
         pytest.importorskip("Box2D")
-    healthy("LunarLander-v3", 150_000)
+    assert healthy("LunarLander-v3", 150_000) == ({}, 0)
 
 
 def test_training_is_the_same_with_it():

@@ -6,12 +6,13 @@ import sys
 import pytest
 import torch as th
 from environments import Corridor, Tree
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import GradientQualityCallback
-from sb3_reinforce.diagnostics.quality_callback import first_episodes
+from sb3_reinforce.diagnostics.quality_callback import evenly_spread
 from sb3_reinforce.scores import episode_gradients
 
 
@@ -63,12 +64,53 @@ def test_the_variance_is_that_of_the_episodes_gradients():
     assert history["gradient/snr"] == [pytest.approx(8 * signal / trace, rel=1e-3)]
 
 
+def test_the_signal_to_noise_ratio_is_that_of_the_weights_of_training():
+    model = train(GradientQualityCallback(1), 1, baseline="mean", n_episodes=8, learning_rate=0.0)
+    rollout = model._rollout
+    weights = rollout.returns - rollout.returns[rollout.used].mean()
+    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
+    trace = float(gradients.var(0).sum())
+    signal = float(gradients.mean(0).square().sum()) - trace / 8
+    assert model.logger.history["gradient/snr"] == [pytest.approx(8 * signal / trace, rel=1e-3)]
+
+
+def test_no_baseline_is_given_more_episodes_than_allowed():
+    given = []
+
+    def counted(rollout):
+        given.append(len(th.unique(rollout.episodes[rollout.used])))
+        return rollout.returns * 0
+
+    train(GradientQualityCallback(1, [counted], max_episodes=4), 1, baseline="none", n_episodes=20)
+    assert given == [4]
+
+
 def test_no_more_episodes_than_allowed_are_looked_at():
     model = train(timesteps=1, baseline="none", n_episodes=12)
-    few = first_episodes(model._rollout, 5)
+    few = evenly_spread(model._rollout, 5)
     assert len(th.unique(few.episodes[few.used])) == 5
     assert few.used.sum() < model._rollout.used.sum()
-    assert first_episodes(model._rollout, 12) is model._rollout
+    assert evenly_spread(model._rollout, 12) is model._rollout
+
+
+def test_of_finite_differences_it_logs_the_cosine_between_updates():
+    model = FiniteDifference("LinearPolicy", Tree(), learning_rate=0.1, seed=0)
+    model.set_logger(Recorded())
+    thetas = []
+
+    class Thetas(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            thetas.append(model.theta)
+
+    history = model.learn(200, [Thetas(), GradientQualityCallback(1)]).logger.history
+    assert {key for key in history if key.startswith("gradient/")} == {"gradient/cosine"}
+    steps = th.stack(thetas).diff(dim=0)
+    expected = th.cosine_similarity(steps[1:], steps[:-1]).tolist()
+    assert len(expected) >= 2
+    assert history["gradient/cosine"] == pytest.approx(expected)
 
 
 def test_a_single_episode_has_no_variance_to_log():

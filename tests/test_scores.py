@@ -11,7 +11,7 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, scores
 from sb3_reinforce.scores import PIECE, episode_gradients, gradients_by_episode
 
 ACTION_SPACES = [
@@ -36,6 +36,8 @@ def assert_as_one_by_one(rollout, **kwargs):
     after = rollout.policy.named_parameters(remove_duplicate=False)
     assert all(old is new for (_, old), (_, new) in zip(before, after, strict=True)), "the policy is as it was"
     th.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4 * float(alone.abs().max()))
+    part = gradients_by_episode(rollout, *weights, columns=slice(3, 6), **kwargs)
+    th.testing.assert_close(part, together[..., 3:6])
 
 
 @pytest.mark.parametrize("action_space", ACTION_SPACES)
@@ -74,6 +76,23 @@ class Branching(ActorCriticPolicy):
 
 def test_a_policy_that_cannot_be_traced_is_taken_one_by_one():
     assert_as_one_by_one(collect(Corridor((2, 9)), Branching))
+
+
+class OutOfMemory(ActorCriticPolicy):
+    """Has memory for a few steps at a time."""
+
+    def evaluate_actions(self, obs, actions):
+        if len(obs) > 4:
+            raise th.OutOfMemoryError("no memory for so many steps")
+        return super().evaluate_actions(obs, actions)
+
+
+def test_an_error_of_the_policy_is_not_taken_for_one_that_cannot_be_traced(monkeypatch):
+    rollout = collect(Corridor((2, 9)))
+    rollout = replace(rollout, policy=REINFORCE(OutOfMemory, Corridor((2, 9)), device="cpu").policy)
+    monkeypatch.setattr(scores, "episode_gradients", None)
+    with pytest.raises(th.OutOfMemoryError, match="no memory"):
+        gradients_by_episode(rollout, rollout.returns)
 
 
 class Detached(ActorCriticPolicy):

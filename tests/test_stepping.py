@@ -80,6 +80,10 @@ def test_it_returns_what_step_returns(space: str) -> None:
             wanted = {key: value for key, value in other.items() if done or key != "terminal_observation"}
             np.testing.assert_equal(info, wanted)
         assert ours.reset_infos == theirs.reset_infos
+        # What a callback may look at
+        for name in ("actions", "buf_rews", "buf_dones"):
+            assert_same(getattr(ours, name), getattr(theirs, name))
+        assert ours.buf_infos == infos
 
 
 def test_what_was_returned_stays_as_it_was() -> None:
@@ -99,12 +103,17 @@ def test_what_was_returned_stays_as_it_was() -> None:
     assert n_ended > 50
 
 
+@pytest.mark.parametrize("method", ["step", "step_async", "step_wait"])
+def test_a_replaced_method_is_called(method: str) -> None:
+    env = make("box")
+    setattr(env, method, lambda *args: None)
+    assert stepper(env) == env.step
+
+
 def test_only_a_plain_dummy_vec_env_is_stepped_so() -> None:
     class Own(DummyVecEnv):
         pass
 
-    plain, replaced = make("box"), make("box")
-    assert stepper(plain).func is step_in_turn  # type: ignore[attr-defined]
-    replaced.step_wait = lambda: None  # type: ignore[assignment,method-assign]
-    for env in (replaced, VecNormalize(make("box")), make_vec_env("CartPole-v1", 2, vec_env_cls=Own)):
+    assert stepper(make("box")).func is step_in_turn  # type: ignore[attr-defined]
+    for env in (VecNormalize(make("box")), make_vec_env("CartPole-v1", 2, vec_env_cls=Own)):
         assert stepper(env) == env.step

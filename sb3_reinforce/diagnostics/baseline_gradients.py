@@ -1,11 +1,12 @@
 """What each baseline leaves of the gradients of the same episodes, from one pass over them."""
 
 import time
+from collections.abc import Iterator
 
 import torch as th
 
 from sb3_reinforce.baselines import ratio_of_others
-from sb3_reinforce.diagnostics.gradient_statistics import gram
+from sb3_reinforce.diagnostics.moments import gram
 from sb3_reinforce.rollouts import Rollout
 from sb3_reinforce.scores import CHUNK, gradients_by_episode, scored_parameters
 
@@ -15,8 +16,8 @@ def grams(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, 
     ``K_ij = ⟨g_i, g_j⟩`` of the episodes' gradients for each baseline, for ``"optimal"`` and for the ``"floor"``.
 
     With ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``, a baseline that is a constant b along an episode leaves
-    A − b S, without another derivative; so do the optimal one and the floor. The others are one more weight each, in
-    the pass that A and S need anyway, and in as many more as memory asks for.
+    A − b S, whose products follow from those of A and S; so do those of the optimal one. The others are one more weight
+    each, in the pass that A and S need anyway.
 
     :param rollout: m whole episodes
     :param baselines: b_t by name, each of shape ``(n_steps, n_envs)``
@@ -32,26 +33,43 @@ def grams(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, 
             constants[name] = b
         else:
             weights[name] = rollout.discounts * (rollout.returns - baseline)
-    at_once = 4 * CHUNK // (n_episodes * sum(parameter.numel() for parameter in scored_parameters(rollout)))
-    names, n_first = list(weights), max(0, at_once - 2)
-    first = [weights[name] for name in names[:n_first]]
 
-    begin = time.perf_counter()
-    weighted, scores, *gradients = gradients_by_episode(
-        rollout, rollout.discounts * rollout.returns, rollout.discounts, *first
-    )
-    seconds = (time.perf_counter() - begin) * 2 / (2 + len(first))
-    # As the baseline itself computes them, from the gradients that are there already
-    constants["optimal"] = ratio_of_others((weighted * scores).sum(1).double(), scores.square().sum(1).double())
-
-    found = {"floor": gram(componentwise_residuals(weighted, scores))}
-    found |= {name: gram(weighted - b.to(scores)[:, None] * scores) for name, b in constants.items()}
-    found |= {name: gram(g) for name, g in zip(names[:n_first], gradients, strict=True)}
-    for start in range(n_first, len(names), max(1, at_once)):
-        group = names[start : start + max(1, at_once)]
-        more = gradients_by_episode(rollout, *(weights[name] for name in group))
-        found |= {name: gram(g) for name, g in zip(group, more, strict=True)}
+    names = ("A A", "A S", "S S", "floor", *weights)
+    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in names}
+    seconds, begin = 0.0, time.perf_counter()
+    for weighted, scores, *others in gradient_blocks(
+        rollout, rollout.discounts * rollout.returns, rollout.discounts, *weights.values()
+    ):
+        seconds += (time.perf_counter() - begin) * 2 / (2 + len(others))
+        products = gram(th.cat([weighted, scores]))
+        found["A A"] += products[:n_episodes, :n_episodes]
+        found["A S"] += products[:n_episodes, n_episodes:]
+        found["S S"] += products[n_episodes:, n_episodes:]
+        found["floor"] += gram(componentwise_residuals(weighted, scores))
+        for name, gradients in zip(weights, others, strict=True):
+            found[name] += gram(gradients)
+        begin = time.perf_counter()
+    a_a, a_s, s_s = (found.pop(name) for name in ("A A", "A S", "S S"))
+    # As the baseline itself computes them, from the products that are there already
+    constants["optimal"] = ratio_of_others(a_s.diagonal(), s_s.diagonal())
+    for name, b in constants.items():
+        found[name] = a_a - a_s * b - (a_s * b).T + s_s * b * b[:, None]
     return found, seconds
+
+
+def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
+    """
+    ``gradients_by_episode``, some components of θ at a time: sums over θ need not hold all of it.
+
+    :param rollout: The rollout, with m episodes that have used steps
+    :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
+    :param floats: Those that a block may have; what they are cut from is computed anew for each block
+    :return: Blocks of shape ``(k, m, c)``
+    """
+    n_parameters = sum(parameter.numel() for parameter in scored_parameters(rollout))
+    n_columns = max(1, floats // (len(weights) * len(th.unique(rollout.episodes[rollout.used]))))
+    for start in range(0, n_parameters, n_columns):
+        yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))
 
 
 def componentwise_residuals(weighted: th.Tensor, scores: th.Tensor) -> th.Tensor:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import torch as th
 
@@ -10,8 +11,8 @@ from sb3_reinforce.arguments import check_choice, check_function, check_integer,
 from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.diagnostics.baseline_gradients import grams
 from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
-from sb3_reinforce.diagnostics.gradient_statistics import moments, signal_to_noise, variance
-from sb3_reinforce.diagnostics.sampling import check_model, sample
+from sb3_reinforce.diagnostics.moments import moments, signal_to_noise, variance
+from sb3_reinforce.diagnostics.sampling import check_independent, check_model, sample, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
@@ -57,9 +58,9 @@ def compare_baselines(
     have a smaller variance; a baseline that knows the time or the state can.
 
     What all names cost with an MlpPolicy and 100 episodes of CartPole-v1, in plain forward and backward passes over
-    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of three or four runs, one thread of a
-    busy machine): 0.8 to 1.1 before training, and 1.5 to 1.7 with collecting the episodes; for a trained policy, whose
-    episodes last 500 steps, 1.2 to 1.9, and 6.0 to 8.1 with collecting them, most of it the environments' own time.
+    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of 11 runs, one thread): 1.3 before
+    training, and 2.3 with collecting the episodes; for a trained policy, whose episodes last 500 steps, 1.9, and 8.6
+    with collecting them, which is the environments' own time for the most part.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes, at least 3
@@ -67,19 +68,21 @@ def compare_baselines(
     :param reference: Name of the baseline that the ratios of variances are to
     :param n_resamples: Bootstrap resamples behind the intervals
     :param confidence: Probability that an interval is to cover the truth
-    :param seed: Seed of the resamples
+    :param seed: Seed of the resamples and of the actions; the environments go on from where they are
     :return: A table with a ``BaselineRow`` each
     :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
-    :raises ValueError: If there are too few episodes, a name is unknown, ``"value"`` has no critic, or the reference is
-        not among the baselines
+    :raises ValueError: If there are too few episodes, a name is unknown or taken twice, ``"value"`` has no critic, the
+        reference is not among the baselines, or episodes are not independent because they share the noise of gSDE
     """
     check_model(model)
+    check_independent(model)
     functions, n_episodes = functions_of(model, baselines), check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
     check_number("confidence", confidence, 0, 1)
     counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
-    rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
-    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes)", rows)
+    with seeded(model.policy, seed):
+        rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
+    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes; floor: of constants)", rows)
 
 
 def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -> dict[str, Baseline]:
@@ -89,19 +92,27 @@ def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -
     :param model: The model
     :param baselines: As for ``compare_baselines``
     :raises TypeError: If a baseline is neither a name nor callable
-    :raises ValueError: If a name is unknown, or ``"value"`` has no critic
+    :raises ValueError: If a name is unknown, taken by another baseline or by a row, or ``"value"`` has no critic
     """
     if baselines is None:
         baselines = [name for name in BASELINES if name != "value" or model.has_critic]
     functions: dict[str, Baseline] = {"none": BASELINES["none"]}
-    for baseline in [baselines] if isinstance(baselines, str) or callable(baselines) else baselines:
+    if not isinstance(baselines, Iterable) or isinstance(baselines, str):
+        baselines = [cast(str | Baseline, baselines)]
+    for baseline in baselines:
         function = check_function("baselines", baseline, BASELINES)
         if function is BASELINES["value"] and not model.has_critic:
             raise ValueError(
                 f"baselines has 'value', and the model has no critic: its baseline is {model.baseline!r}. Train one "
                 "with baseline='value', or leave it out"
             )
-        functions[baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))] = function
+        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
+        if name in ("optimal", "floor") and function is not BASELINES.get(name):
+            raise ValueError(
+                f"baselines has a function named {name!r}, which is the name of a row: give it another one"
+            )
+        if functions.setdefault(name, function) is not function:
+            raise ValueError(f"baselines must have names that differ, and two of its functions are named {name!r}")
     return functions
 
 

@@ -1,30 +1,22 @@
 """The families of gradient estimators at one θ: which of them sees the gradient of a task from the fewest steps."""
 
-import copy
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import cast
 
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import baselines
 from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
-from sb3_reinforce.diagnostics.gradient_statistics import cosine, gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
-from sb3_reinforce.diagnostics.sampling import sampled
+from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
+from sb3_reinforce.diagnostics.moments import cosine, gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.sampling import check_independent, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.parameters import actor_parameters
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.search_settings import default_delta_std, default_n_delta
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
@@ -36,7 +28,7 @@ class EstimatorRow:
     One estimator of the gradient of ``U(θ) = E[Σ_t r_t]``.
 
     :param estimator: Its name
-    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient of other episodes
+    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient, whose noise is in the interval too
     :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, by the environment steps behind it
     :param steps: Environment steps behind one estimate, of all environments
     :param seconds: Time behind one estimate
@@ -52,11 +44,11 @@ class EstimatorRow:
 def compare_estimators(
     model: REINFORCE | FiniteDifference,
     n_episodes: int = 100,
-    n_estimates: int = 10,
+    n_estimates: int = 50,
     estimators: Iterable[str] = (LIKELIHOOD_RATIO, "forward", "central", "regression"),
-    perturbation: str | Perturbation = "gaussian",
+    perturbation: str | Perturbation = "coordinate",
     n_delta: int | None = None,
-    delta_std: float | None = None,
+    delta_std: float | None = 1.0,
     n_resamples: int = 500,
     confidence: float = 0.95,
     seed: int = 0,
@@ -72,26 +64,32 @@ def compare_estimators(
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes of the likelihood ratio, and as many again for the gradient to compare with, at least 3
-    :param n_estimates: Estimates by each of the others, at least 3
+    :param n_estimates: Estimates by each of the others, at least 3; below about 20 the intervals are too narrow
     :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
-    :param perturbation: As for FiniteDifference
+    :param perturbation: As for FiniteDifference. As many Gaussian perturbations as parameters are all but dependent,
+        and a difference that is solved for them is mostly noise; coordinates are not
     :param n_delta: As for FiniteDifference; None for the rule of thumb
-    :param delta_std: As for FiniteDifference; None for the rule of thumb
+    :param delta_std: As for FiniteDifference, whose rule of thumb None stands for. A single episode behind a utility is
+        too noisy for steps as small as those of training, so that the default is larger
     :param n_resamples: Bootstrap resamples behind the intervals
     :param confidence: Probability that an interval is to cover the truth
-    :param seed: Seed of perturbations, episodes and resamples
+    :param seed: Seed of perturbations, episodes (of the environments too) and resamples
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
-    :raises ValueError: If an argument is out of its range, a name is unknown, or the model has no environment
+    :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
+        episodes are not independent because they share the noise of gSDE
     """
     if not isinstance(model, REINFORCE | FiniteDifference):
         raise TypeError(f"model must be a REINFORCE or FiniteDifference, got {model!r} of type {type(model).__name__}")
-    names = tuple(estimators)
-    for name in names:
+    check_independent(model)
+    names = (estimators,) if isinstance(estimators, str) else tuple(estimators)
+    for name in names or ("",):
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
     check_integer("n_episodes", n_episodes, 3)
     check_integer("n_estimates", n_estimates, 3)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
+    if n_delta is not None:
+        check_integer("n_delta", n_delta, 2)
     utility = CandidateUtility(model, 1, seed)
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
     scale = (
@@ -100,7 +98,7 @@ def compare_estimators(
     generator = th.Generator().manual_seed(seed)
 
     def difference(name: str) -> Callable[[], tuple[th.Tensor, int]]:
-        k = default_n_delta(name, len(utility.theta)) if n_delta is None else check_integer("n_delta", n_delta, 2)
+        k = default_n_delta(name, len(utility.theta)) if n_delta is None else n_delta
 
         def estimate() -> tuple[th.Tensor, int]:
             before = utility.n_steps
@@ -109,18 +107,21 @@ def compare_estimators(
 
         return estimate
 
-    reference = likelihood_ratio(model, n_episodes)[0]
     rows = []
-    for name in names:
-        begin = time.perf_counter()
-        if name == LIKELIHOOD_RATIO:
-            gradients, n_steps = likelihood_ratio(model, n_episodes)
-        else:
-            estimate = difference(name)
-            found, steps = zip(*(estimate() for _ in range(n_estimates)), strict=True)
-            gradients, n_steps = th.stack(found), sum(steps)
-        seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
-        rows.append(estimator_row(name, gradients, reference, n_steps / len(gradients), seconds, counts, confidence))
+    with seeded(model.policy, seed):
+        reference = likelihood_ratio(model, n_episodes)[0]
+        reference_counts = resamples(n_episodes, n_resamples, seed + 1)
+        for name in names:
+            begin = time.perf_counter()
+            if name == LIKELIHOOD_RATIO:
+                gradients, n_steps = likelihood_ratio(model, n_episodes)
+            else:
+                estimate = difference(name)
+                found, made = zip(*(estimate() for _ in range(n_estimates)), strict=True)
+                gradients, n_steps = th.stack(found), sum(made)
+            seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
+            steps = n_steps / len(gradients)
+            rows.append(estimator_row(name, gradients, reference, steps, seconds, counts, reference_counts, confidence))
     return Table(f"Gradient of U(θ) for {len(utility.theta)} parameters by estimator", rows)
 
 
@@ -131,6 +132,7 @@ def estimator_row(
     steps: float,
     seconds: float,
     counts: th.Tensor,
+    reference_counts: th.Tensor,
     confidence: float,
 ) -> EstimatorRow:
     """
@@ -142,54 +144,13 @@ def estimator_row(
     :param steps: Environment steps behind one estimate
     :param seconds: Time behind all estimates
     :param counts: Resamples of the estimates, shape ``(r, m)``
+    :param reference_counts: Resamples of the reference, shape ``(r, m')``
     :param confidence: Probability that an interval is to cover the truth
     """
-    found = moments(gram(gradients), counts)
+    found, of_reference = moments(gram(gradients), counts), moments(gram(reference), reference_counts)
+    products = (counts @ (gradients @ reference.T) * reference_counts).sum(1) / (
+        counts.sum(1) * reference_counts.sum(1)
+    )
+    to_reference = cosine(found, of_reference, products, confidence)
     ratio = interval(signal_to_noise(found) / steps, confidence)
-    to_reference = UNKNOWN
-    # The norm of the reference without its noise, which would make every cosine too small
-    squared = float(moments(gram(reference), th.ones(1, len(reference), dtype=th.float64)).signal)
-    if squared > 0:
-        products = counts @ (gradients @ reference.mean(0)) / counts.sum(1) / squared**0.5
-        to_reference = interval(cosine(found, products), confidence)
     return EstimatorRow(name, to_reference, ratio, steps, seconds / len(gradients))
-
-
-def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:
-    """
-    Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``.
-
-    :param model: The model
-    :param n_episodes: Number of episodes
-    :return: Shape ``(n_episodes, n)``, float64; and the environment steps that they took, of all environments
-    """
-    plain = as_reinforce(model)
-    sampler, infos = sampled(plain, n_episodes, "leave_one_out")
-    rollout = cast(Rollout, sampler._rollout)
-    baseline = baselines.leave_one_out(rollout)
-    gradients = gradients_by_episode(rollout, rollout.returns - baseline)[0].double().cpu()
-    wanted = {id(parameter) for parameter in actor_parameters(plain.policy)}
-    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
-    return gradients[:, mask], len(infos.infos) * cast(VecEnv, plain.env).num_envs
-
-
-def as_reinforce(model: BaseAlgorithm) -> REINFORCE:
-    """
-    A REINFORCE at γ = 1 with a model's policy and environments, which keeps nothing of its own.
-
-    :param model: A REINFORCE or FiniteDifference
-    """
-    if isinstance(model, REINFORCE):
-        plain = copy.copy(model)
-    else:
-        plain = REINFORCE(
-            type(model.policy),  # type: ignore[arg-type]
-            cast(VecEnv, model.env),
-            policy_kwargs=model.policy_kwargs,
-            max_episode_steps=getattr(model, "max_episode_steps", 100_000),
-            device=model.device,
-        )
-        plain.policy = cast(ActorCriticPolicy, model.policy)
-    plain.gamma, plain.gae_lambda, plain.reward_to_go, plain.discount_scores = 1.0, 1.0, True, False
-    plain.baseline = "leave_one_out"
-    return plain

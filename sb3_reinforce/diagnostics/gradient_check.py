@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch as th
-
 from sb3_reinforce.arguments import check_integer
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error, some
 from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
-from sb3_reinforce.diagnostics.sampling import check_model, sampled
+from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.policies import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
@@ -54,10 +52,11 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
     ``log_prob``: log π that training differentiates is log π of the actions drawn. ``scores``: its gradient by autograd
     is that by finite differences. ``sign``: a step along the score of an action makes the policy draw it more often, or
-    draw nearer to it. ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
-    ``surrogate``: the step of ``train()`` is the sum of the weighted scores. A policy of one's own, or a subclass of
-    REINFORCE, is checked as it is. With gSDE ``scores`` fails as Stable-Baselines3 makes it: the standard deviation's
-    dependence on the features is detached there, unless ``policy.action_dist.learn_features`` is set.
+    draw nearer to it; a policy that always draws the same cannot be checked for it, and does not pass. ``returns`` and
+    ``weights``: G_t and G_t − b_t follow from the rewards by their definitions. ``surrogate``: the step of ``train()``
+    is the sum of the weighted scores. A policy of one's own, or a subclass of REINFORCE, is checked as it is. With gSDE
+    ``scores`` fails as Stable-Baselines3 makes it: the standard deviation's dependence on the features is detached
+    there, unless ``policy.action_dist.learn_features`` is set.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes, at least 2
@@ -68,16 +67,14 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     """
     check_model(model)
     check_integer("n_episodes", n_episodes, 2)
-    policy, optimizer, training = model.policy, model.policy.optimizer, model.policy.training
+    policy, optimizer = model.policy, model.policy.optimizer
     state = {name: value.clone() for name, value in policy.state_dict().items()}
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(check_integer("seed", seed, 0))
+    with seeded(policy, check_integer("seed", seed, 0)):
         try:
             rows = check_rows(model, n_episodes)
         finally:
             policy.load_state_dict(state)
             policy.optimizer = optimizer
-            policy.set_training_mode(training)
     return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows)
 
 
@@ -95,8 +92,10 @@ def check_rows(model: REINFORCE, n_episodes: int) -> list[CheckRow]:
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
     scored_parameters(rollout)
     return [
-        row("log_prob", log_prob_error(policy, obs), 1e-4, "log π(a|s) when drawn and when evaluated"),
-        row("scores", score_error(policy, obs, actions), 0.02, "∇ log π by autograd and by differences"),
+        row(
+            "log_prob", log_prob_error(policy, some(obs, actions)[0]), 1e-4, "log π(a|s) when drawn and when evaluated"
+        ),
+        row("scores", score_error(policy, *some(obs, actions)), 0.02, "∇ log π by autograd and by differences"),
         row("sign", sign_error(policy, obs), 0.0, "share of actions that their own score repels"),
         row("returns", return_error(sampler, rollout, infos), 1e-4, "G_t and its definition, from the rewards"),
         row("weights", weight_error(sampler, rollout), 1e-4, "the weights of training and G_t − b_t"),

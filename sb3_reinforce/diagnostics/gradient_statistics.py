@@ -1,38 +1,20 @@
 """
 How good an estimate of the gradient is: statistics of m sampled gradients, each with an interval.
 
-A sample is the gradient of one episode, or of one batch; the estimate is the mean of the samples. All of them
-are functions of ``E‖g‖²`` and ``‖E g‖²``, of which the Gram matrix ``K_ij = ⟨g_i, g_j⟩`` has unbiased estimates. So a
-bootstrap costs m² a resample, whatever the number of parameters.
+A sample is the gradient of one episode, or of one batch; the estimate is the mean of the samples. For the formulas see
+``moments``.
 
 The samples are taken to be independent. Those of a baseline that looks at the other episodes of the batch are so up to
 terms of order 1/m.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import torch as th
 
 from sb3_reinforce.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
-
-
-@dataclass(frozen=True)
-class Moments:
-    """
-    Of a gradient g, or of its resamples.
-
-    :param second: ``E‖g‖²``
-    :param signal: ``‖E g‖²``; an unbiased estimate of it can be negative
-    """
-
-    second: th.Tensor
-    signal: th.Tensor
-
-
-Statistic: TypeAlias = Callable[[Moments], th.Tensor]
+from sb3_reinforce.diagnostics.moments import Moments, cosine, gram, moments, noise_scale, signal_to_noise, variance
 
 
 @dataclass(frozen=True)
@@ -52,68 +34,6 @@ class GradientStatistics:
     snr: Estimate
     noise_scale: Estimate
     cosine: Estimate | None
-
-
-def gram(gradients: th.Tensor) -> th.Tensor:
-    """
-    ``K = g gᵀ``.
-
-    :param gradients: Shape ``(m, n)``
-    :return: Shape ``(m, m)``, float64, on the CPU
-    """
-    gradients = gradients.double()
-    product: th.Tensor = (gradients @ gradients.T).cpu()
-    return product
-
-
-def moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
-    """
-    ``E‖g‖² ≈ Σ_i c_i K_ii / Σ_i c_i`` and ``‖E g‖² ≈ Σ_{i≠j} c_i c_j K_ij / Σ_{i≠j} c_i c_j``.
-
-    Both are unbiased for counts of 1. The second leaves out the pairs of a sample with itself, and of a resample with
-    its own copies, which would count noise as signal (a U-statistic: Hoeffding, 1948).
-
-    :param gram: ``K_ij = ⟨g_i, g_j⟩``, shape ``(m, m)``
-    :param counts: How often each sample is in each resample, shape ``(r, m)``
-    :return: Moments of shape ``(r,)``
-    """
-    diagonal = gram.diagonal()
-    second = counts @ diagonal / counts.sum(1)
-    pairs = ((counts @ gram) * counts).sum(1) - counts.square() @ diagonal
-    return Moments(second, pairs / (counts.sum(1).square() - counts.square().sum(1)))
-
-
-def variance(of: Moments) -> th.Tensor:
-    """
-    ``tr Σ = E‖g‖² − ‖E g‖²``. Unbiased: it is the trace of the sample covariance with denominator m − 1.
-
-    :param of: Moments
-    """
-    return of.second - of.signal
-
-
-def signal_to_noise(of: Moments) -> th.Tensor:
-    """
-    ``SNR = ‖E g‖² / tr Σ`` (Roberts and Tedrake, 2009, "Signal-to-noise ratio analysis of policy gradient
-    algorithms", there with the part of the noise that is orthogonal to E g).
-
-    Consistent; a ratio of two unbiased numbers is not unbiased itself. Negative where there is more noise than signal
-    to be seen.
-
-    :param of: Moments
-    """
-    return of.signal / variance(of)
-
-
-def noise_scale(of: Moments) -> th.Tensor:
-    """
-    ``B = tr Σ / ‖E g‖²`` (McCandlish et al., 2018, equation 2.9), infinite where no signal is seen.
-
-    From the unbiased estimates of numerator and denominator, as in their appendix A.1.
-
-    :param of: Moments
-    """
-    return th.where(of.signal > 0, variance(of) / of.signal, th.inf)
 
 
 def check_gradients(gradients: th.Tensor) -> th.Tensor:
@@ -139,19 +59,6 @@ def check_gradients(gradients: th.Tensor) -> th.Tensor:
     return gradients.detach().cpu().double()
 
 
-def cosine(of: Moments, products: th.Tensor) -> th.Tensor:
-    """
-    ``cos = ⟨E g, r⟩ / (‖E g‖ ‖r‖)`` to a reference r, and 0 where no signal is seen.
-
-    Consistent for the true gradient: with the norm of the mean of the samples in the denominator, their noise would
-    make it too small, by about ``√(1 + B / m)`` at the noise scale B.
-
-    :param of: Moments of g
-    :param products: ``⟨E g, r⟩ / ‖r‖``, of the same shape
-    """
-    return th.where(of.signal > 0, products / of.signal.clamp(min=1e-300).sqrt(), 0.0).clamp(-1, 1)
-
-
 def gradient_statistics(
     gradients: th.Tensor,
     reference: th.Tensor | None = None,
@@ -162,15 +69,16 @@ def gradient_statistics(
     """
     Mean, variance, signal-to-noise ratio and noise scale of sampled gradients, with bootstrap intervals.
 
-    Where there is next to no signal (SNR of the mean below about 1), the intervals of SNR, noise scale and cosine are
-    wider than they need be.
+    The intervals are percentiles, and too narrow for few samples: that of the variance covers it in 86 % of the cases
+    with 5 Gaussian samples and in 90 % with 10, instead of 95 %; from about 20 on it holds. Where there is next to no
+    signal (SNR of the mean below about 1), those of SNR and noise scale are wider than they need be.
 
     :param gradients: m independent samples of the gradient, shape ``(m, n)``
     :param reference: A gradient to compare the mean with, shape ``(n,)``
     :param n_resamples: Bootstrap resamples
     :param confidence: Probability that an interval is to cover the truth
     :param seed: Seed of the resamples
-    :raises TypeError: If the gradients are not a tensor
+    :raises TypeError: If the gradients or the reference are not a tensor
     :raises ValueError: If there are fewer than two, if they are not finite, or do not go with the reference
     """
     gradients = check_gradients(gradients)
@@ -179,14 +87,17 @@ def gradient_statistics(
     found = moments(gram(gradients), counts)
     to_reference = None
     if reference is not None:
+        if not isinstance(reference, th.Tensor):
+            raise TypeError(f"reference must be a tensor, got {reference!r} of type {type(reference).__name__}")
         if reference.shape != gradients.shape[1:] or not reference.norm() > 0:
             raise ValueError(
                 f"reference must be a nonzero gradient of shape (n,) = {tuple(gradients.shape[1:])}, got shape "
                 f"{tuple(reference.shape)} and norm {float(reference.norm())}"
             )
-        direction = reference.detach().cpu().double() / reference.norm().cpu()
-        products = counts @ (gradients @ direction) / counts.sum(1)
-        to_reference = interval(cosine(found, products), confidence)
+        known = reference.detach().cpu().double()
+        square = (known @ known).expand(len(counts))
+        products = counts @ (gradients @ known) / counts.sum(1)
+        to_reference = cosine(found, Moments(square, square), products, confidence)
     return GradientStatistics(
         mean=gradients.mean(0),
         variance=interval(variance(found), confidence),

@@ -1,6 +1,6 @@
 """The performance landscape: U(θ) on a plane through the parameters of a policy, and the steps that estimators take."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -15,7 +15,7 @@ from sb3_reinforce import parameters
 from sb3_reinforce.arguments import check_integer, check_number
 from sb3_reinforce.candidate_actors import make_actor
 from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.diagnostics.sampling import undisturbed
+from sb3_reinforce.diagnostics.sampling import check_env, seeded, undisturbed
 
 
 class CandidateUtility:
@@ -35,15 +35,15 @@ class CandidateUtility:
     def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
         if not isinstance(getattr(model, "policy", None), ActorCriticPolicy):
             raise TypeError(f"model must have an actor-critic policy, got {model!r} of type {type(model).__name__}")
-        if model.env is None:
-            raise ValueError("model must have an environment to sample episodes from: call set_env first")
+        n_envs = check_env(model).num_envs
         self.model, self.n_episodes = model, check_integer("n_episodes", n_episodes, 1)
         self.seed, self.n_steps = check_integer("seed", seed, 0), 0
         policy = cast(ActorCriticPolicy, model.policy)
-        policy.set_training_mode(False)
+        training = policy.training
         self.parameters = parameters.actor_parameters(policy)
+        policy.set_training_mode(training)
         self.theta = parameters.read(self.parameters)
-        self.actor = make_actor(policy, self.parameters, model.env.num_envs, deterministic=False)
+        self.actor = make_actor(policy, self.parameters, n_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:
         """
@@ -58,6 +58,7 @@ class CandidateUtility:
         limit = getattr(self.model, "max_episode_steps", 100_000)
         env, normalize = cast(VecEnv, self.model.env), self.model.get_vec_normalize_env()
         with undisturbed(self.model):
+            self.model.policy.set_training_mode(False)
             returns = evaluate(self.actor, env, candidates, seeds, self.n_episodes, limit, self.count, normalize)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
@@ -87,7 +88,7 @@ class Landscape:
 
 def landscape(
     model: BaseAlgorithm,
-    gradients: dict[str, th.Tensor] | None = None,
+    gradients: Mapping[str, th.Tensor] | None = None,
     directions: th.Tensor | None = None,
     extent: float = 1.0,
     n_points: int = 11,
@@ -105,12 +106,17 @@ def landscape(
     :param n_points: Points along each side
     :param n_episodes: Episodes behind each point
     :param seed: Seed of the directions and of the episodes
+    :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range or of the wrong shape
     """
     check_number("extent", extent, 0, above=True)
     check_integer("n_points", n_points, 2)
     utility = CandidateUtility(model, n_episodes, seed)
-    n = len(utility.theta)
+    n, gradients = len(utility.theta), {} if gradients is None else gradients
+    if not isinstance(gradients, Mapping):
+        raise TypeError(f"gradients must be a dictionary of tensors by name, got {type(gradients).__name__}")
+    for name, gradient in gradients.items():
+        check_direction(f"gradients[{name!r}]", gradient, (n,))
     if directions is None:
         drawn = th.randn(2, n, dtype=th.float64, generator=th.Generator().manual_seed(seed))
         plane = th.stack([filter_normalized(direction, utility.parameters) for direction in drawn])
@@ -119,10 +125,10 @@ def landscape(
         plane = directions.double() / directions.double().norm(dim=1, keepdim=True) * utility.theta.norm()
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
-    utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
+    with seeded(cast(ActorCriticPolicy, model.policy), seed):
+        utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
     steps = {}
-    for name, gradient in (gradients or {}).items():
-        check_direction(f"gradients[{name!r}]", gradient, (n,))
+    for name, gradient in gradients.items():
         projection = th.linalg.lstsq(plane.T, gradient.double()[:, None]).solution[:, 0]
         steps[name] = (extent * projection / projection.norm().clamp(min=1e-300)).numpy()
     return Landscape(scales.numpy(), utilities.numpy(), steps)
@@ -135,8 +141,11 @@ def check_direction(name: str, direction: th.Tensor, shape: Sequence[int]) -> No
     :param name: Its name, for the message
     :param direction: The direction
     :param shape: Its shape
+    :raises TypeError: If it is not a tensor
     :raises ValueError: If it is of another shape, not finite, or zero
     """
+    if not isinstance(direction, th.Tensor):
+        raise TypeError(f"{name} must be a tensor, got {direction!r} of type {type(direction).__name__}")
     norms = direction.double().norm(dim=-1)
     if direction.shape != th.Size(shape) or not bool((norms.isfinite() & (norms > 0)).all()):
         raise ValueError(

@@ -6,15 +6,15 @@ from collections import deque
 from typing import cast
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_reinforce.collection import by_step
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
-from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.updates import Seen, Update
 from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout, select, take
+from sb3_reinforce.rollouts import Rollout, TensorOrDict, select, take
 from sb3_reinforce.scores import flat, scored_parameters
 
 
@@ -23,8 +23,10 @@ class PitfallCallback(BaseCallback):
     Says once, in a warning, which of the known pitfalls training has fallen into, and which argument to change.
 
     The pitfalls are those of ``pitfalls.PITFALLS``. They are read from what training has logged and computed anyway;
-    the cost is two forward passes and a backward pass over at most 256 steps of a rollout, and nothing of the training
+    the cost is three forward passes and a backward pass over at most 256 steps of a rollout. Nothing of the training
     is changed.
+
+    They are those of the likelihood ratio: a FiniteDifference has no returns to weigh, and is refused.
 
     :param verbose: Verbosity level
     :raises TypeError: If the model is not a REINFORCE
@@ -52,7 +54,7 @@ class PitfallCallback(BaseCallback):
         rollout = self.rollout = cast(Rollout, model._rollout)
         self.parameters = self.parameters or scored_parameters(rollout)
         log_prob = self.log_prob(rollout)
-        weights = th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)) * rollout.discounts
+        weights = training_weights(model) * rollout.discounts
         weighed = (log_prob * weights[rollout.used][: len(log_prob)].to(log_prob)).sum()
         gradient = flat(th.autograd.grad(weighed, self.parameters))
         self.before, self.gradient = log_prob.detach(), gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
@@ -69,9 +71,31 @@ class PitfallCallback(BaseCallback):
 
         :param rollout: The rollout
         """
-        steps = th.arange(min(self.N_STEPS, int(rollout.used.sum())))
-        actions = as_policy_actions(take(select(rollout.actions, rollout.used), steps), self.model.action_space)
-        return log_prob_and_entropy(rollout.policy, take(select(rollout.observations, rollout.used), steps), actions)[0]
+        actions = as_policy_actions(self.first(rollout.actions, rollout), self.model.action_space)
+        return log_prob_and_entropy(rollout.policy, self.first(rollout.observations, rollout), actions)[0]
+
+    @th.no_grad()
+    def std(self, rollout: Rollout) -> float:
+        """
+        The mean standard deviation of the actions at the first used steps of a rollout, now; NaN if not Gaussian.
+
+        With gSDE it depends on the observation, and ``train/std`` is that of the noise's weights.
+
+        :param rollout: The rollout
+        """
+        if not isinstance(self.model.action_space, spaces.Box):
+            return math.nan
+        distribution = rollout.policy.get_distribution(self.first(rollout.observations, rollout)).distribution
+        return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
+
+    def first(self, tensors: TensorOrDict, rollout: Rollout) -> TensorOrDict:
+        """
+        The first used steps of a rollout, at most ``N_STEPS``.
+
+        :param tensors: Observations or actions of the rollout
+        :param rollout: The rollout
+        """
+        return take(select(tensors, rollout.used), th.arange(min(self.N_STEPS, int(rollout.used.sum()))))
 
     def look(self) -> None:
         """Take in the update that has followed the last rollout, and report what is new."""
@@ -97,11 +121,12 @@ class PitfallCallback(BaseCallback):
         return Update(
             kl=float(change.mean()),
             entropy=-logged.get("train/entropy_loss", math.nan),
-            std=logged.get("train/std", math.nan),
+            std=self.std(rollout),
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,
             return_scale=float(rollout.returns[used].square().mean().sqrt()),
+            return_std=float(rollout.returns[used].std(correction=0)),
             n_episodes=len(th.unique(rollout.episodes[used])),
             n_steps=int(used.sum()),
             used_fraction=float(used.double().mean()),

@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, signal_to_noise
+from sb3_reinforce.diagnostics.moments import gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.updates import Seen, Update
 
 Pitfall: TypeAlias = Callable[[Seen], str | None]
@@ -22,16 +22,23 @@ Pitfall: TypeAlias = Callable[[Seen], str | None]
 
 def rate_too_large(seen: Seen) -> str | None:
     """
-    A policy that leaps: a KL divergence above 1 in one update, or a median above 0.1 over ten.
+    A policy that leaps: a KL divergence above 1 in one update, a median above 0.1 over ten, or more than half of the
+    randomness that it could have gone within ten.
 
     :param seen: What was seen
     """
-    steps = [update.kl for update in seen.updates[-10:]]
+    steps, space = [update.kl for update in seen.updates[-10:]], seen.model.action_space
+    remedy = f"Lower the learning rate, now {seen.model.lr_schedule(seen.model._current_progress_remaining):.2g}"
     if steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1):
         return (
             f"The policy leaps: its KL divergence from one update to the next is {steps[-1]:.2g} (median of the last "
-            f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). Lower learning_rate={seen.model.learning_rate!r}, or "
-            f"let it decay"
+            f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let learning_rate decay"
+        )
+    before, after = randomness(space, seen.updates[-10:][0]), randomness(space, seen.updates[-1])
+    if before - after > 0.5:
+        return (
+            f"The entropy collapses: within {len(steps)} updates the policy went from {before:.0%} to {after:.0%} of "
+            f"the randomness that it could have. {remedy} (learning_rate), or raise ent_coef"
         )
     return None
 
@@ -53,12 +60,16 @@ def unscaled_returns(seen: Seen) -> str | None:
 
 def too_few_episodes(seen: Seen) -> str | None:
     """
-    Fewer than four episodes an update, and a signal-to-noise ratio of the gradients of 50 updates below 0.1.
+    A signal-to-noise ratio of the gradients of 50 updates below 0.1, from few episodes or parts of them (fewer than
+    eight an update) or few steps (fewer than 64).
+
+    The ratio alone would not do: it is near 0 for a policy that has nothing left to learn, however large its batches.
 
     :param seen: What was seen
     """
     n_episodes = fmean(update.n_episodes for update in seen.updates)
-    if len(seen.updates) < 50 or n_episodes >= 4:
+    n_steps = fmean(update.n_steps for update in seen.updates)
+    if len(seen.updates) < 50 or (n_episodes >= 8 and n_steps >= 64):
         return None
     gradients = th.stack([update.gradient for update in seen.updates])
     ratio = float(signal_to_noise(moments(gram(gradients), th.ones(1, len(gradients), dtype=th.float64))))
@@ -66,7 +77,8 @@ def too_few_episodes(seen: Seen) -> str | None:
         argument = "n_episodes" if seen.model.n_steps is None else "n_steps, or the number of environments"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "
-            f"{ratio:.2g}, with {n_episodes:.1f} episodes an update. Raise {argument}: 20 episodes or more are usual"
+            f"{ratio:.2g}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}: 20 "
+            "episodes or more are usual"
         )
     return None
 
@@ -104,9 +116,11 @@ def useless_critic(seen: Seen) -> str | None:
     """
     A critic whose values explain none of the variance of the returns, after 100 updates and half of the training.
 
+    Returns that vary by less than a tenth of their size, as those of a pole that never falls, leave little to explain.
+
     :param seen: What was seen
     """
-    explained = [update.explained_variance for update in seen.updates if math.isfinite(update.explained_variance)]
+    explained = [update.explained_variance for update in seen.updates if worth_explaining(update)]
     late = seen.n_updates >= 100 and seen.model._current_progress_remaining < 0.5
     if seen.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
         return (
@@ -115,6 +129,15 @@ def useless_critic(seen: Seen) -> str | None:
             "scale the returns (VecNormalize), or use another baseline"
         )
     return None
+
+
+def worth_explaining(update: Update) -> bool:
+    """
+    Whether there is a critic, and returns that vary.
+
+    :param update: The update
+    """
+    return math.isfinite(update.explained_variance) and update.return_std > 0.1 * update.return_scale
 
 
 def deterministic_too_early(seen: Seen) -> str | None:
@@ -128,8 +151,8 @@ def deterministic_too_early(seen: Seen) -> str | None:
         remedy = "raise min_std" if isinstance(seen.model.action_space, spaces.Box) else "raise temperature"
         return (
             f"With {left:.0%} of the training left the policy is all but deterministic ({share:.1%} of the randomness "
-            f"that it could have), and its scores vanish. Raise ent_coef={seen.model.ent_coef!r}, {remedy}, or lower "
-            "learning_rate"
+            f"that it could have), and its scores vanish. Raise ent_coef (now "
+            f"{seen.model._scheduled('ent_coef'):.2g}), {remedy}, or lower learning_rate"
         )
     return None
 

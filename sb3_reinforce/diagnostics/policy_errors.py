@@ -9,8 +9,10 @@ from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.rollouts import take
 from sb3_reinforce.scores import flat, score_parameters
 
-# Draws behind a frequency or a mean action
-N_DRAWS = 1024
+# Draws behind a frequency or a mean action, and for observations of more elements than LARGE
+N_DRAWS, N_DRAWS_LARGE, LARGE = 1024, 256, 4096
+# Elements of the observations whose log π is differentiated by differences
+N_ELEMENTS = 2**21
 
 
 def relative(x: th.Tensor, y: th.Tensor) -> float:
@@ -35,6 +37,28 @@ def log_prob_error(policy: ActorCriticPolicy, obs: PyTorchObs) -> float:
     drawn, _, log_prob = policy(obs)
     evaluated, _ = log_prob_and_entropy(policy, obs, flat_actions(policy, drawn))
     return float(((evaluated - log_prob).abs() / log_prob.abs().clamp(min=1)).max())
+
+
+def size_of(obs: PyTorchObs) -> int:
+    """
+    The number of elements of one observation.
+
+    :param obs: ``n`` observations
+    """
+    parts = list(obs.values()) if isinstance(obs, dict) else [obs]
+    return sum(part[0].numel() for part in parts)
+
+
+def some(obs: PyTorchObs, actions: th.Tensor) -> tuple[PyTorchObs, th.Tensor]:
+    """
+    Steps spread evenly over a rollout, as many as ``N_ELEMENTS`` allow.
+
+    :param obs: ``n`` observations
+    :param actions: ``n`` actions
+    """
+    allowed = max(1, N_ELEMENTS // size_of(obs))
+    steps = th.arange(0, len(actions), -(-len(actions) // allowed))
+    return take(obs, steps), actions[steps]
 
 
 def flat_actions(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
@@ -93,19 +117,34 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -
     :param policy: The policy
     :param obs: ``n`` observations
     :param n_actions: Actions to try, at most n
+    :return: NaN if all draws are alike, as those of a policy without randomness are: nothing could be tried
     """
     n_obs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
     wrong, tried = 0, 0
+    n_draws = N_DRAWS_LARGE if size_of(obs) > LARGE else N_DRAWS
     for index in th.randperm(n_obs)[:n_actions]:
-        repeated = take(obs, index.repeat(N_DRAWS))
+        repeated = take(obs, index.repeat(n_draws))
         with th.no_grad():
-            draws = flat_actions(policy, policy(repeated)[0])
+            draws = draw(policy, repeated, n_draws)
         # Of a few draws the one that is farthest from the rest: a step along its score is the plainest to see
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
-        before, after = closeness_after_step(policy, repeated, action)
+        before, after = closeness_after_step(policy, repeated, action, n_draws)
         if before < closeness(policy, action[None].expand_as(draws), action):
             wrong, tried = wrong + int(after <= before), tried + 1
-    return wrong / max(1, tried)
+    return wrong / tried if tried else float("nan")
+
+
+def draw(policy: ActorCriticPolicy, obs: PyTorchObs, n_draws: int) -> th.Tensor:
+    """
+    Independent actions; with gSDE each by a noise matrix of its own.
+
+    :param policy: The policy
+    :param obs: One observation, ``n_draws`` times
+    :param n_draws: Their number
+    """
+    if policy.use_sde:
+        policy.reset_noise(n_draws)
+    return flat_actions(policy, policy(obs)[0])
 
 
 def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:
@@ -122,13 +161,16 @@ def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) ->
     return (draws == action).double().mean()
 
 
-def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def closeness_after_step(
+    policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor, n_draws: int
+) -> tuple[th.Tensor, th.Tensor]:
     """
     ``closeness`` before and after a step along the score of an action, with the same random numbers.
 
     :param policy: The policy; it is left as it was
-    :param obs: One observation, ``N_DRAWS`` times
+    :param obs: One observation, ``n_draws`` times
     :param action: The action
+    :param n_draws: Actions to draw before and after
     """
     parameters = score_parameters(policy, take(obs, th.arange(1)), action[None])
     log_prob, _ = log_prob_and_entropy(policy, take(obs, th.arange(1)), action[None])
@@ -141,6 +183,6 @@ def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.
         th.nn.utils.vector_to_parameters(values, parameters)
         with th.random.fork_rng(devices=[]), th.no_grad():
             th.manual_seed(seed)
-            results.append(closeness(policy, flat_actions(policy, policy(obs)[0]), action))
+            results.append(closeness(policy, draw(policy, obs, n_draws), action))
     th.nn.utils.vector_to_parameters(theta, parameters)
     return results[0], results[1]

@@ -9,14 +9,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
-from sb3_reinforce.collection import by_step
+from sb3_reinforce.diagnostics.baseline_gradients import gradient_blocks
 from sb3_reinforce.diagnostics.comparisons import functions_of
-from sb3_reinforce.diagnostics.gradient_statistics import gram, moments, noise_scale, signal_to_noise, variance
-from sb3_reinforce.diagnostics.sampling import check_model
+from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
+from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.scores import scored_parameters
 from sb3_reinforce.weighing import check_baseline
 
 
@@ -28,20 +29,25 @@ class GradientQualityCallback(BaseCallback):
 
     - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient with its own weights;
     - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, in episodes: rollouts of that many are as much signal as noise;
-    - ``gradient/variance/<baseline>``: tr Σ of one episode, for each of ``baselines`` on the same episodes;
+    - ``gradient/variance/<baseline>``: tr Σ of one episode, for each of ``baselines``, computed from these episodes;
     - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
+
+    For a FiniteDifference it is the cosine alone: episodes there have no gradients of their own. How good its estimate
+    is, it logs itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
     A sample g is the gradient of one episode, or of the part of it that a fixed rollout holds. The estimates are those
     of a single rollout, and noisy where it has few episodes; with fewer than two there is nothing to log. The cost is
-    about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, divided by
-    ``every``; nothing is sampled for it, and training is the same with and without it.
+    about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, two more
+    with ``"optimal"``, and as much again for each 256 MiB that their gradients take, divided by ``every``. Nothing is
+    sampled for it, and training is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
     :param max_episodes: Episodes of a rollout that are looked at
     :param verbose: Verbosity level
-    :raises TypeError: If an argument is of the wrong kind, or the model is not a REINFORCE
-    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic
+    :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
+    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic, or
+        if the model's episodes are not independent because they share the noise of gSDE
     """
 
     def __init__(
@@ -60,20 +66,35 @@ class GradientQualityCallback(BaseCallback):
         self.parameters: Parameters = []
 
     def _init_callback(self) -> None:
+        if isinstance(self.model, FiniteDifference):
+            return
         check_model(self.model)
+        check_independent(self.model)
         self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        rollout = cast(Rollout, cast(REINFORCE, self.model)._rollout)
-        self.parameters = self.parameters or scored_parameters(rollout)
-        self.thetas = [*self.thetas[-2:], th.nn.utils.parameters_to_vector(self.parameters).detach().clone()]
-        self.n_rollouts += 1
+        model = self.model
+        if isinstance(model, FiniteDifference):
+            theta = model.theta
+        else:
+            rollout = cast(Rollout, cast(REINFORCE, model)._rollout)
+            self.parameters = self.parameters or scored_parameters(rollout)
+            theta = th.nn.utils.parameters_to_vector(self.parameters).detach().clone()
+        self.thetas, self.n_rollouts = [*self.thetas[-2:], theta], self.n_rollouts + 1
         if self.n_rollouts % self.every == 0:
-            for key, figure in self.measure(rollout).items():
+            figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)
+            for key, figure in figures.items():
                 self.logger.record(f"gradient/{key}", figure)
+
+    def cosine(self) -> dict[str, float]:
+        """The cosine between the last two updates, once there have been two."""
+        if len(self.thetas) < 3:
+            return {}
+        before, after = self.thetas[1] - self.thetas[0], self.thetas[2] - self.thetas[1]
+        return {"cosine": float(th.cosine_similarity(before, after, dim=0))}
 
     def measure(self, rollout: Rollout) -> dict[str, float]:
         """
@@ -81,22 +102,21 @@ class GradientQualityCallback(BaseCallback):
 
         :param rollout: The rollout, before training on it
         """
-        figures = {}
-        if len(self.thetas) == 3:
-            before, after = self.thetas[1] - self.thetas[0], self.thetas[2] - self.thetas[1]
-            figures["cosine"] = float(th.cosine_similarity(before, after, dim=0))
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
         if n_episodes < 2:
-            return figures
-        buffer = cast(REINFORCE, self.model).rollout_buffer
-        weights = {"": th.as_tensor(by_step(buffer, buffer.advantages)).double() * rollout.discounts}
+            return {}
+        figures = {}
+        weights = {"": training_weights(cast(REINFORCE, self.model)) * rollout.discounts}
+        rollout = evenly_spread(rollout, self.max_episodes)
         for name, function in self.functions.items():
             baseline = th.as_tensor(check_baseline(function(rollout), rollout))
             weights[name] = rollout.discounts * (rollout.returns - baseline)
-        rollout = first_episodes(rollout, self.max_episodes)
-        ones = th.ones(1, min(n_episodes, self.max_episodes), dtype=th.float64)
-        for name, gradients in zip(weights, gradients_by_episode(rollout, *weights.values()), strict=True):
-            found = moments(gram(gradients), ones)
+        n_seen = min(n_episodes, self.max_episodes)
+        matrices = th.zeros(len(weights), n_seen, n_seen, dtype=th.float64)
+        for block in gradient_blocks(rollout, *weights.values()):
+            matrices += th.stack([gram(gradients) for gradients in block])
+        for name, matrix in zip(weights, matrices, strict=True):
+            found = moments(matrix, th.ones(1, n_seen, dtype=th.float64))
             if name:
                 figures[f"variance/{name}"] = float(variance(found))
             else:
@@ -105,9 +125,9 @@ class GradientQualityCallback(BaseCallback):
         return figures
 
 
-def first_episodes(rollout: Rollout, n_episodes: int) -> Rollout:
+def evenly_spread(rollout: Rollout, n_episodes: int) -> Rollout:
     """
-    A rollout of which only so many episodes are used, taken evenly from the environments.
+    A rollout of which only so many episodes are used, spread evenly over the environments.
 
     :param rollout: The rollout
     :param n_episodes: Their number

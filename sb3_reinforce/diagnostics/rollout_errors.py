@@ -4,10 +4,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
-from sb3_reinforce.collection import by_step
 from sb3_reinforce.critic import stack
 from sb3_reinforce.diagnostics.policy_errors import relative
-from sb3_reinforce.diagnostics.sampling import Infos
+from sb3_reinforce.diagnostics.sampling import Infos, training_weights
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
 from sb3_reinforce.scores import gradients_by_episode, scored_parameters
@@ -70,8 +69,7 @@ def weight_error(sampler: REINFORCE, rollout: Rollout) -> float:
     :param rollout: What it collected
     """
     expected = (rollout.returns - sampler._weighing.baseline(rollout).cpu()) * rollout.used
-    weights = th.as_tensor(by_step(sampler.rollout_buffer, sampler.rollout_buffer.advantages)).double()
-    return relative(weights, expected)
+    return relative(training_weights(sampler), expected)
 
 
 def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
@@ -82,8 +80,9 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     :param sampler: The model that collected; its policy is trained
     :param rollout: What it collected
     """
-    weights = th.as_tensor(by_step(sampler.rollout_buffer, sampler.rollout_buffer.advantages)).double()
-    expected = gradients_by_episode(rollout, weights * rollout.discounts)[0].sum(0) / sampler._denominator(rollout)
+    expected = gradients_by_episode(rollout, training_weights(sampler) * rollout.discounts)[0].sum(
+        0
+    ) / sampler._denominator(rollout)
     parameters = scored_parameters(rollout)
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
     sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=1.0)

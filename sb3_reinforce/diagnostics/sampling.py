@@ -7,13 +7,16 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.arguments import check_integer
 from sb3_reinforce.baselines import Baseline
+from sb3_reinforce.collection import by_step
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
 
@@ -39,6 +42,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     The model keeps its parameters, counters and log, and the statistics of a VecNormalize stay as they are; its
     environments are left at the start of an episode.
 
+    With gSDE the episodes share noise, unless ``sde_sample_freq=1``, and are not independent samples.
+
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: The baseline to collect with; None for ``"value"`` where the model has a critic, else ``"none"``
@@ -51,13 +56,16 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     return sampler._rollout
 
 
-def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | None = None) -> tuple[AnyREINFORCE, Infos]:
+def sampled(
+    model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | None = None, seed: int | None = None
+) -> tuple[AnyREINFORCE, Infos]:
     """
     A copy of the model, which shares its policy and environments, after it has collected a rollout; and the infos.
 
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: As for ``sample``
+    :param seed: The seed of the environments; None to let them go on
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
@@ -73,10 +81,29 @@ def sampled(model: AnyREINFORCE, n_episodes: int, baseline: str | Baseline | Non
     callback = Infos()
     callback.init_callback(sampler)
     with undisturbed(model):
+        if seed is not None:
+            env.seed(seed)
         sampler._last_obs = env.reset()  # type: ignore[assignment]
         sampler._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         sampler.collect_rollouts(env, callback, sampler.rollout_buffer, None)
     return sampler, callback
+
+
+@contextmanager
+def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
+    """
+    Draw from a seed in the block, and leave PyTorch's generator and the mode of a policy as they were.
+
+    :param policy: The policy
+    :param seed: The seed
+    """
+    training = policy.training
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        try:
+            yield
+        finally:
+            policy.set_training_mode(training)
 
 
 @contextmanager
@@ -113,6 +140,42 @@ def check_model(model: Any) -> VecEnv:
     """
     if not isinstance(model, REINFORCE):
         raise TypeError(f"model must be a REINFORCE, got {model!r} of type {type(model).__name__}")
+    return check_env(model)
+
+
+def check_env(model: BaseAlgorithm) -> VecEnv:
+    """
+    Check that a model has environments.
+
+    :param model: The model
+    :return: Its environments
+    :raises ValueError: If it has none
+    """
     if model.env is None:
         raise ValueError("model must have an environment to sample episodes from: call set_env first")
     return model.env
+
+
+def check_independent(model: BaseAlgorithm) -> None:
+    """
+    Check that the episodes of a model are independent samples, as the statistics of their gradients take them to be.
+
+    :param model: The model
+    :raises ValueError: If they share noise
+    """
+    if model.use_sde and model.sde_sample_freq != 1:
+        raise ValueError(
+            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, and the "
+            "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
+            "without use_sde"
+        )
+
+
+def training_weights(model: REINFORCE) -> th.Tensor:
+    """
+    What training reads as G_t − b_t, before or after it has trained on the rollout.
+
+    :param model: A model that has collected a rollout
+    :return: Shape ``(n_steps, n_envs)``, float64
+    """
+    return th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)).double()
