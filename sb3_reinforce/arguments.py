@@ -131,7 +131,7 @@ class CheckedSchedule(FloatSchedule):
 
     def __call__(self, progress_remaining: float) -> float:
         value = self.value_schedule(progress_remaining)
-        value = value.item() if hasattr(value, "item") and np.size(value) == 1 else value
+        value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
         return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, self.above)
 
 

@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_reinforce.candidate_actors import MatrixActor
+from sb3_reinforce.environment_checks import all_finite
 from sb3_reinforce.stepping import stepper
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
@@ -91,8 +92,7 @@ class Slots:
         :raises ValueError: As ``add``
         """
         for key, part in obs.items() if isinstance(obs, dict) else (("", obs),):
-            if part.dtype.kind == "f":
-                self.check(f"The observation {key!r}" if key else "The observation", part)
+            self.check(f"The observation {key!r}" if key else "The observation", part)
 
     def check(self, name: str, values: np.ndarray) -> None:
         """
@@ -102,11 +102,9 @@ class Slots:
         :param values: Shape ``(n_envs, ...)``
         :raises ValueError: As ``add``
         """
-        finite = np.isfinite(values)
-        # count_nonzero, here and below, because any() and all() cost several times as much on a few numbers
-        if np.count_nonzero(finite) == finite.size:
+        if all_finite(values):
             return
-        bad = ~finite.reshape(len(values), -1).all(1) & self.active
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(1) & self.active
         for i in np.flatnonzero(bad).tolist():
             raise ValueError(f"{name} of {self.describe(i)} is not finite: {values[i]}. {UNCHANGED}")
 
@@ -182,6 +180,7 @@ def evaluate(
             slots.add(rewards if original is None else original(), new_obs)
             finished = dones & slots.active
             on_step(Step(new_obs, rewards, dones, infos, finished))
+            # any() costs several times as much on a few numbers
             if np.count_nonzero(finished):
                 begun = slots.finish(finished, returns)
     return returns

@@ -60,7 +60,7 @@ def interruptible() -> Iterator[None]:
     for number in (signal.SIGINT, signal.SIGTERM) if in_main_thread() else ():
         handler = before = signal.getsignal(number)
         if number == signal.SIGTERM and before is signal.SIG_DFL:
-            handler = interrupt
+            handler = signal.default_int_handler
         if callable(handler):
             own[number] = before
             signal.signal(number, partial(uninterrupted.handle, handler))
@@ -69,16 +69,6 @@ def interruptible() -> Iterator[None]:
     finally:
         for changed, before in own.items():
             signal.signal(changed, before)
-
-
-def interrupt(number: int, frame: FrameType | None) -> None:
-    """
-    Do at a signal what Python does at Ctrl-C.
-
-    :param number: The signal
-    :param frame: Where it came
-    """
-    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def in_main_thread() -> bool:

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from copy import deepcopy
 from inspect import signature
 from typing import Any, TypeVar
@@ -136,10 +135,14 @@ class Persistent(BaseAlgorithm):
             for key, number in numbers(name, state):
                 if th.isnan(number).any() or (key not in buffers and th.isinf(number).any()):
                     raise ValueError(f"load_path_or_dict must have finite numbers, got {number} for {key}")
-        with unchanged_on_error(self):
+        before: Any = deepcopy(self.get_parameters())
+        try:
             super().set_parameters(own, exact_match, device)
             for name in own:
                 check_settings(name, recursive_getattr(self, name))
+        except BaseException:
+            super().set_parameters(before, device=device)
+            raise
 
 
 def arguments_of(cls: type) -> set[str]:
@@ -171,23 +174,6 @@ def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
         parts = state.items() if isinstance(state, Mapping) else enumerate(state)
         for key, part in parts:
             yield from numbers(f"{name}.{key}", part)
-
-
-@contextmanager
-def unchanged_on_error(model: BaseAlgorithm) -> Iterator[None]:
-    """
-    Let parameters be set within the block. If that fails half-way, they are put back.
-
-    :param model: The model
-    """
-    before = deepcopy(model.get_parameters())
-    try:
-        yield
-    except BaseException:
-        for name, state in before.items():
-            part = recursive_getattr(model, name)
-            getattr(part, "_orig_mod", part).load_state_dict(state)
-        raise
 
 
 def check_settings(name: str, part: Any) -> None:

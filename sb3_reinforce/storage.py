@@ -7,7 +7,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 from uuid import uuid4
@@ -65,16 +65,17 @@ def replace(path: Path, content: bytes) -> None:
     try:
         try:
             # A file without a name vanishes with its process
-            with open(os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666), "wb") as file:
+            nameless = os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666)
+            with open(nameless, "wb") as file:
                 write(file, content, path)
-                give_name(file.fileno(), beside)
+                # Only with a src_dir_fd, which it does not need, does this follow the link in /proc
+                os.link(f"/proc/self/fd/{nameless}", beside, src_dir_fd=nameless)
         except (AttributeError, OSError):
             with open(beside, "xb") as file:
                 write(file, content, path)
         os.replace(beside, path)
     finally:
-        with suppress(FileNotFoundError):
-            beside.unlink()
+        beside.unlink(missing_ok=True)
 
 
 def write(file: Any, content: bytes, path: Path) -> None:
@@ -90,21 +91,6 @@ def write(file: Any, content: bytes, path: Path) -> None:
     file.write(content)
     file.flush()
     os.fsync(file.fileno())
-
-
-def give_name(descriptor: int, path: Path) -> None:
-    """
-    Name a file that has none.
-
-    :param descriptor: The file descriptor
-    :param path: The name
-    """
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        # Only with a folder does this follow the link in /proc
-        os.link(f"/proc/self/fd/{descriptor}", path, src_dir_fd=folder, follow_symlinks=True)
-    finally:
-        os.close(folder)
 
 
 def check_archive(place: Place, needed: tuple[str, ...]) -> set[str]:

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from models import KINDS, make
@@ -16,7 +17,7 @@ AT_CONSTRUCTION = {
     "learning_rate": (-1e-3, NAN, INF, 1e7, "x", None, lambda progress: NAN, lambda progress: np.ones(2)),
     "max_grad_norm": (0, -1, NAN),
     "max_episode_steps": (0, NAN),
-    "seed": (-1, 1.5, "x"),
+    "seed": (-1, 1.5, "x", 2**32),
     "stats_window_size": (0, -1, NAN),
     "policy_kwargs": (3, "x"),
     "tensorboard_log": (3,),
@@ -31,6 +32,13 @@ def test_what_both_algorithms_take_is_checked_at_construction(kind, name, values
     for value in values:
         with pytest.raises((TypeError, ValueError), match=name):
             make(kind, **{name: value})
+
+
+@both
+@pytest.mark.parametrize("form", [float, np.float32, np.array, lambda rate: np.array([rate]), th.tensor])
+def test_forms_that_stand_for_the_value_of_a_schedule(form, kind):
+    model = make(kind, learning_rate=lambda progress: form(1e-3), seed=2**32 - 1).learn(8)
+    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("name", ["common_random_numbers", "standardize_utilities", "deterministic"])
@@ -100,6 +108,37 @@ def test_load_checks_the_arguments_that_it_replaces(kind, tmp_path):
         with pytest.raises((TypeError, ValueError), match=name):
             KINDS[kind][0].load(tmp_path / "model", **{name: value})
     assert KINDS[kind][0].load(tmp_path / "model", max_grad_norm=0.1, seed=3, device="cpu").max_grad_norm == 0.1
+
+
+@both
+def test_load_replaces_arguments_that_a_subclass_hands_on(kind, tmp_path):
+    algorithm = KINDS[kind][0]
+
+    class Own(algorithm):
+        def __init__(self, *args, own=1, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.own = own
+
+    Own("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
+    loaded = Own.load(tmp_path / "model", max_grad_norm=0.1, own=2, device="cpu")
+    assert type(loaded) is Own and (loaded.max_grad_norm, loaded.own) == (0.1, 2)
+    with pytest.raises(TypeError, match="gama"):
+        Own.load(tmp_path / "model", gama=0.9)
+
+
+@both
+def test_load_checks_the_argument_for_the_random_state(kind, tmp_path):
+    model = make(kind)
+    model.save(tmp_path / "with")
+    for value in ("no", 1, None):
+        with pytest.raises(TypeError, match="restore_random_state"):
+            KINDS[kind][0].load(tmp_path / "with", restore_random_state=value)
+    model.save(tmp_path / "without", exclude=["_random_state"])
+    before = th.get_rng_state()
+    with pytest.raises(ValueError, match=r"restore_random_state must be False for .*without"):
+        KINDS[kind][0].load(tmp_path / "without", restore_random_state=True)
+    assert th.equal(th.get_rng_state(), before)
+    KINDS[kind][0].load(tmp_path / "without", device="cpu")
 
 
 @both

@@ -4,6 +4,8 @@ import gc
 import os
 import signal
 import threading
+import time
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from models import KINDS, make
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
 LENGTH = 7
@@ -61,6 +65,10 @@ class Faulty(Corridor):
             raise OSError("the simulator has gone")
         if self.fault == f"die in {when}":
             os.kill(os.getpid(), signal.SIGKILL)
+        if self.fault in signal.Signals.__members__ and when == "step":
+            os.kill(os.getppid(), signal.Signals[self.fault])
+            # The answer comes when the learner has long stopped waiting for it
+            time.sleep(0.2)
 
 
 def of_two(**fault):
@@ -105,7 +113,7 @@ def test_numbers_that_are_not_finite(name, normalized, kind, tmp_path):
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     if normalized:
         assert all(np.isfinite(part).all() for part in statistics(env)) and env.training
-        assert not {"reset", "step_wait", "_save_obs"} & vars(env.venv).keys()
+        assert type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
     model.save(tmp_path / "model")
     assert KINDS[kind][0].load(tmp_path / "model", env=of_two()).learn(32).num_timesteps >= 32
     if normalized:
@@ -126,7 +134,9 @@ def test_statistics_are_those_before_the_bad_step(kind):
             return result
 
     env = Watching(of_two(fault="reward", at=20, value=NAN))
-    with pytest.raises(ValueError, match=r"reward of environment 1 is not finite: nan \(step 19 since learn\(\) began\)"):
+    with pytest.raises(
+        ValueError, match=r"reward of environment 1 is not finite: nan \(step 19 since learn\(\) began\)"
+    ):
         make(kind, env).learn(400)
     assert len(seen) == 19
     if kind != "search":
@@ -159,18 +169,53 @@ MALFORMED = {
     "a dict": {"x": 1},
     "complex": np.ones(LENGTH) * 1j,
     "objects": np.array([None] * LENGTH),
+    "ragged": [[0.0], [0.0, 1.0]],
 }
+# Where the second environment returns it, and in which step of all of them
+WHEN = {
+    "step": (dict(fault="observation", at=5), 4),
+    "end": (dict(fault="observation", at=LENGTH), LENGTH - 1),
+    "truncation": (dict(fault="observation", at=LENGTH, truncate=True), LENGTH - 1),
+    "reset": (dict(fault="first observation", at=2), LENGTH - 1),
+}
+WRAPPERS = {"bare": lambda env: env, "monitor": VecMonitor, "normalize": VecNormalize}
 
 
 @pytest.mark.parametrize("kind", ["steps", "search"])
 @pytest.mark.parametrize("name", MALFORMED)
-@pytest.mark.parametrize("fault", ["observation", "first observation"])
-def test_observations_of_another_form(fault, name, kind):
-    env = of_two(fault=fault, at=5 if fault == "observation" else 2, value=MALFORMED[name])
-    model = make(kind, env)
-    with pytest.raises(ValueError, match=r"observation of environment 1 must .*shape"):
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_observations_of_another_form(wrapper, when, name, kind):
+    fault, step = WHEN[when]
+    # The search resets its environments once more before its first step
+    fault = fault | {"at": 3} if (when, kind) == ("reset", "search") else fault
+    model = make(kind, WRAPPERS[wrapper](of_two(value=MALFORMED[name], **fault)))
+    with pytest.raises(ValueError, match=rf"observation of environment 1 must .*\(step {step} since learn\(\) began\)"):
         model.learn(400)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize("wrapper", ["bare", "normalize"])
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_observations_of_another_form_from_a_worker(when, wrapper):
+    fault, step = WHEN[when]
+    for name in ("too long", "a string", "complex"):
+        env = of_three("fork", value=MALFORMED[name], **fault)
+        model = make("steps", WRAPPERS[wrapper](env))
+        with pytest.raises(ValueError, match=rf"observation of environment 1 must .*\(step {step} since"):
+            model.learn(400)
+        env.close()
+
+
+@all_kinds
+@pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], ids=str)
+@pytest.mark.parametrize("value", [-1, 3, 0.5])
+def test_categories_that_the_space_does_not_have(value, space, kind):
+    value = np.full(space.shape, value)[()]
+    env = of_two(fault="observation", at=5, value=value, observation_space=space)
+    with pytest.raises(ValueError, match=r"observation of environment 1 must .*\(step 4 since"):
+        make(kind, env).learn(400)
 
 
 @all_kinds
@@ -207,16 +252,35 @@ def test_forms_that_stand_for_an_observation_are_taken(kind):
         assert make(kind, Form((3,))).learn(32).num_timesteps >= 32
 
 
-@all_kinds
-@pytest.mark.parametrize("value", ["x", np.ones(2), 1j])
-def test_rewards_that_are_no_numbers(value, kind):
-    model = make(kind, of_two(fault="reward", at=5, value=value))
-    with pytest.raises(ValueError, match="reward of environment 1 must be a number"):
+@pytest.mark.parametrize("kind", ["steps", "search"])
+@pytest.mark.parametrize("value", ["x", "1.0", np.ones(2), 1j, np.complex128(1), None], ids=repr)
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_rewards_that_are_no_numbers(wrapper, value, kind):
+    model = make(kind, WRAPPERS[wrapper](of_two(fault="reward", at=5, value=value)))
+    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
         model.learn(400)
 
 
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_rewards_of_a_worker_that_are_no_numbers():
+    for value in ("x", np.ones(2), 1j):
+        env = of_three("fork", fault="reward", at=5, value=value)
+        with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
+            make("steps", env).learn(400)
+        env.close()
+
+
+@all_kinds
+@pytest.mark.parametrize("value", [np.float64(2), np.int64(2), np.array(2.0), th.tensor(2.0), True, 2], ids=repr)
+def test_forms_that_stand_for_a_reward_are_taken(value, kind):
+    model = make(kind, Corridor((3,), reward=lambda t, action: value)).learn(32)
+    assert model.ep_info_buffer[0]["r"] == 3 * float(value)
+
+
 def of_three(start_method, **fault):
-    return SubprocVecEnv([Faulty, lambda: Faulty(**fault), Faulty], start_method=start_method)
+    truncate = {"truncate": fault.get("truncate", False)}
+    envs = [lambda: Faulty(**truncate), lambda: Faulty(**fault), lambda: Faulty(**truncate)]
+    return SubprocVecEnv(envs, start_method=start_method)
 
 
 def end(env):
@@ -245,8 +309,9 @@ def test_a_worker_that_goes_wrong_is_named_with_its_exception(fault, start_metho
     end_of_it = r"raised OSError: the simulator has gone" if "raise" in fault else "was killed by SIGKILL"
     with pytest.raises(ConnectionError, match=f"worker of environment 1 died: it {end_of_it}"):
         model.learn(10_000)
+    env.close()
     watchdog.cancel()
-    end(env)
+    assert all(not process.is_alive() for process in env.processes)
     model.save(tmp_path / "model")
     model.set_env(DummyVecEnv([Faulty] * 3))
     assert model.learn(32).num_timesteps >= 32
@@ -277,3 +342,92 @@ def test_a_folder_for_the_workers_notes_is_removed_with_the_environment():
     del env
     gc.collect()
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("kind", ["steps", "search"])
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_step_of_workers_that_is_broken_off(number, kind):
+    """The answers that nobody has waited for are not taken for those to what is asked next."""
+    env = of_three("fork", fault=number, at=20)
+    watchdog = threading.Timer(60, end, [env])
+    watchdog.start()
+    model = make(kind, env)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(400)
+    before = env.get_attr("n_steps")
+    n_steps = model.num_timesteps
+    model.learn(90, reset_num_timesteps=False)
+    made = [after - each for after, each in zip(env.get_attr("n_steps"), before, strict=True)]
+    assert made == [(model.num_timesteps - n_steps) // 3] * 3
+    env.close()
+    watchdog.cancel()
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_workers_are_closed_after_a_step_that_is_broken_off():
+    env = of_three("fork", fault="SIGTERM", at=5)
+    watchdog = threading.Timer(60, end, [env])
+    watchdog.start()
+    with pytest.raises(KeyboardInterrupt):
+        make("steps", env).learn(400)
+    env.close()
+    watchdog.cancel()
+    assert [process.exitcode for process in env.processes] == [0, 0, 0]
+
+
+class Once(BaseCallback):
+    """Does something at the third step."""
+
+    def __init__(self, act):
+        super().__init__()
+        self.act = act
+
+    def _on_step(self):
+        if self.n_calls == 3:
+            self.act(self.model)
+        return True
+
+
+@all_kinds
+def test_a_nested_vec_normalize_is_guarded_too(kind):
+    inner = VecNormalize(of_two(fault="reward", at=20, value=NAN))
+    outer = VecNormalize(VecFrameStack(inner, 2))
+    with pytest.raises(ValueError, match="reward of environment 1 is not finite"):
+        make(kind, outer).learn(400)
+    assert all(np.isfinite(part).all() for env in (inner, outer) for part in statistics(env))
+
+
+@all_kinds
+def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
+    """They can be asked, saved and copied while a model learns, and a copy leads a life of its own."""
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(Faulty())] * 2))
+
+    def act(model):
+        model.save(tmp_path / "model")
+        env.save(tmp_path / "statistics")
+        assert env.env_is_wrapped(Monitor) == [True, True] and env.unwrapped.num_envs == 2
+        before = env.get_attr("n_steps")
+        copy = deepcopy(env.venv)
+        assert type(copy) is DummyVecEnv
+        copy.reset()
+        copy.step(np.zeros(2, int))
+        assert copy.get_attr("n_steps") == [before[0] + 1] * 2 and env.get_attr("n_steps") == before
+        with pytest.raises(AttributeError):
+            env.no_such_attribute  # noqa: B018
+
+    model = make(kind, env).learn(40, callback=Once(act))
+    assert model.num_timesteps >= 40 and type(env.venv) is DummyVecEnv
+    VecNormalize.load(tmp_path / "statistics", of_two())
+    assert KINDS[kind][0].load(tmp_path / "model", env=of_two(), device="cpu").learn(16).num_timesteps >= 16
+
+
+@all_kinds
+def test_learning_within_a_callback(kind):
+    """What another model has done with the same environments leaves them guarded."""
+    env = VecNormalize(of_two(fault="reward", at=40, value=NAN))
+    other = make("steps", env)
+    with pytest.raises(ValueError, match="reward of environment 1 is not finite"):
+        make(kind, env).learn(400, callback=Once(lambda model: other.learn(16)))
+    assert other.num_timesteps == 16 and type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
+    assert all(np.isfinite(part).all() for part in statistics(env))

@@ -87,6 +87,25 @@ def test_an_update_is_finished_before_a_signal_is_handled(number, kind):
         assert len(critic_steps) == 3 * model.n_critic_updates
 
 
+def test_each_signal_of_an_update_is_handled():
+    seen = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: seen.append(number))
+    model = make("steps", Corridor((7,)))
+
+    def both_signals(*rest):
+        if model._n_updates == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    model.policy.optimizer.register_step_pre_hook(both_signals)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(1000)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert seen == [signal.SIGTERM] and model._n_updates == 3
+
+
 def test_sigterm_is_left_to_a_user_who_handles_it():
     seen = []
     before = signal.signal(signal.SIGTERM, lambda *signaled: seen.append(signaled))

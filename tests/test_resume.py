@@ -2,6 +2,7 @@
 
 import hashlib
 import pickle
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,7 @@ def digest(model, env):
         "episodes": episodes,
         "generator": hashlib.sha256(th.get_rng_state().numpy().tobytes()).hexdigest(),
         "numpy": float(np.random.random()),
+        "python": random.random(),
     }
     for name, part in model.get_parameters().items():
         state[name] = hashlib.sha256(pickle.dumps(plain(part))).hexdigest()
@@ -94,3 +96,13 @@ def test_without_the_argument_the_generators_are_left_alone(tmp_path):
     assert not th.equal(state, th.get_rng_state())
     th.manual_seed(5)
     assert th.equal(th.rand(3), expected)
+
+
+def test_generators_of_other_devices_are_left_alone(tmp_path, monkeypatch):
+    """A model on the CPU must not wake the GPUs of the machine."""
+    for name in ("get_rng_state", "get_rng_state_all", "set_rng_state", "set_rng_state_all"):
+        monkeypatch.setattr(th.cuda, name, lambda *args: pytest.fail("a GPU was asked"))
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 2)
+    make("steps").save(tmp_path / "model")
+    KINDS["steps"][0].load(tmp_path / "model", device="cpu", restore_random_state=True)

@@ -18,6 +18,7 @@ from models import KINDS, make, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import storage
 
@@ -82,6 +83,29 @@ def test_a_file_system_without_nameless_files(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         storage.replace(tmp_path / "file", b"newer")
     assert (tmp_path / "file").read_bytes() == b"new" and os.listdir(tmp_path) == ["file"]
+
+
+def no_link(*args, **kwargs):
+    raise FileNotFoundError(2, "No such file or directory: /proc/self/fd")
+
+
+def test_a_system_without_proc(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", no_link)
+    storage.replace(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new" and os.listdir(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize("nameless", [True, False])
+def test_the_longest_name_and_the_permissions_of_the_file_before(nameless, tmp_path, monkeypatch):
+    if not nameless:
+        monkeypatch.delattr(os, "O_TMPFILE", raising=False)
+    path = tmp_path / f"{'x' * 251}.zip"
+    model = make("steps")
+    model.save(path)
+    for mode in (0o600, 0o640, 0o664):
+        path.chmod(mode)
+        model.save(path)
+        assert path.stat().st_mode & 0o777 == mode and os.listdir(tmp_path) == [path.name]
 
 
 @both
@@ -200,6 +224,23 @@ WRONG = {
     "another shape": lambda p: {**p, "policy": {**p["policy"], last_key(p["policy"]): th.zeros(77)}},
     "a key less": lambda p: {**p, "policy": {k: v for k, v in p["policy"].items() if k != last_key(p["policy"])}},
     "not finite": lambda p: {**p, "policy": {k: v * float("nan") for k, v in p["policy"].items()}},
+    "no finite optimizer": lambda p: {
+        **p,
+        "policy.optimizer": {
+            **p["policy.optimizer"],
+            "state": {
+                i: {key: value * float("nan") for key, value in state.items()}
+                for i, state in p["policy.optimizer"]["state"].items()
+            },
+        },
+    },
+    "no finite learning rate": lambda p: {
+        **p,
+        "policy.optimizer": {
+            **p["policy.optimizer"],
+            "param_groups": [{**group, "lr": float("inf")} for group in p["policy.optimizer"]["param_groups"]],
+        },
+    },
     "another optimizer's groups": lambda p: {
         **p,
         "policy.optimizer": {**p["policy.optimizer"], "param_groups": [{"params": [0]}] * 2},
@@ -239,6 +280,25 @@ def test_the_optimizer_of_a2c_is_refused_and_named():
     del states["policy.optimizer"]
     model.set_parameters(states, exact_match=False)
     assert all(map(th.equal, model.policy.state_dict().values(), states["policy"].values()))
+
+
+class Masked(ActorCriticPolicy):
+    """Has an infinite mask, which is no parameter."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.register_buffer("mask", th.tensor([0.0, -float("inf")]))
+
+
+@both
+def test_a_mask_may_be_infinite(kind, tmp_path):
+    model = make(kind, Corridor(), Masked)
+    model.save(tmp_path / "model")
+    assert KINDS[kind][0].load(tmp_path / "model", device="cpu").policy.mask[1] == -float("inf")
+    states = model.get_parameters()
+    states["policy"]["mask"] = th.tensor([0.0, float("nan")])
+    with pytest.raises(ValueError, match="finite"):
+        model.set_parameters(states)
 
 
 class Malicious:
