@@ -42,7 +42,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     :param actions: Shape ``(n_envs, ...)``
     """
     env.step_async(actions)
-    infos = []
+    infos, rows = [], env.buf_obs.get(None)  # type: ignore[call-overload]
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, env.buf_rews[i], terminated, truncated, info = single.step(action)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
@@ -51,11 +51,14 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        env._save_obs(i, obs)
+        if rows is None:
+            env._save_obs(i, obs)
+        else:
+            rows[i] = obs
         infos.append(info)
     env.buf_infos = infos
-    rows = {key: part.copy() for key, part in env.buf_obs.items()}
-    return dict_to_obs(env.observation_space, rows), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()
+    copies = {key: part.copy() for key, part in env.buf_obs.items()}
+    return dict_to_obs(env.observation_space, copies), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()
 
 
 def step_workers(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
