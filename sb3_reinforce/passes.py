@@ -47,7 +47,9 @@ def lay_out(layers: list[th.nn.Module], n: int) -> Callable[[np.ndarray], Floats
         inputs[:-1] = obs.reshape(n, -1).T
         for operation in operations:
             operation()
-        return np.ascontiguousarray(x[:-1].T)
+        # Not the room itself, which the next observations will overwrite
+        y: Floats = x[:-1].T.copy()
+        return y
 
     return outputs
 

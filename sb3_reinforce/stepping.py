@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
-from stable_baselines3.common.vec_env.util import dict_to_obs
 
 
 def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
@@ -42,12 +41,14 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     :param actions: Shape ``(n_envs, ...)``
     """
     env.step_async(actions)
-    infos, rows = [], env.buf_obs.get(None)  # type: ignore[call-overload]
+    rewards, dones, infos = env.buf_rews, env.buf_dones, []
+    # One array, unless observations are dicts
+    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
-        obs, env.buf_rews[i], terminated, truncated, info = single.step(action)
+        obs, rewards[i], terminated, truncated, info = single.step(action)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
-        env.buf_dones[i] = terminated or truncated
-        if terminated or truncated:
+        dones[i] = is_done = terminated or truncated
+        if is_done:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
@@ -57,8 +58,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             rows[i] = obs
         infos.append(info)
     env.buf_infos = infos
-    copies = {key: part.copy() for key, part in env.buf_obs.items()}
-    return dict_to_obs(env.observation_space, copies), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()
+    return env._obs_from_buf() if rows is None else rows.copy(), rewards.copy(), dones.copy(), infos.copy()
 
 
 def step_workers(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:

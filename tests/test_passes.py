@@ -12,6 +12,7 @@ MLPS = {
     "tanh": [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 4), nn.Tanh(), nn.Linear(4, 2)],
     "relu": [nn.Linear(3, 5), nn.ReLU(), nn.Linear(5, 2)],
     "linear": [nn.Linear(3, 2)],
+    "one output": [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 1)],
     "two activations": [nn.Linear(3, 5), nn.Tanh(), nn.ReLU(), nn.Linear(5, 4), nn.Linear(4, 2)],
 }
 
@@ -25,15 +26,14 @@ def layers(request):
     return layers
 
 
+@pytest.mark.parametrize("n", [1, 7])
 @pytest.mark.parametrize("one_thread", [passes.ONE_THREAD, 0], ids=["by NumPy", "by PyTorch"])
-def test_a_laid_out_mlp_is_the_mlp(layers, one_thread, monkeypatch):
+def test_a_laid_out_mlp_is_the_mlp(layers, one_thread, n, monkeypatch):
     monkeypatch.setattr(passes, "ONE_THREAD", one_thread)
-    forward, modules = lay_out(layers, 7), nn.Sequential(*layers)
-    results = []
-    for obs in th.randn(3, 7, 3):
-        results.append((forward(obs.numpy()), modules(obs).detach().numpy()))
-    for laid_out, expected in results:
-        np.testing.assert_allclose(laid_out, expected, rtol=1e-4, atol=1e-5)
+    forward, obs = lay_out(layers, n), th.randn(3, n, 3)
+    # All of them before any is compared: an output must not change with the next observations
+    outputs = [forward(batch.numpy()) for batch in obs]
+    np.testing.assert_allclose(outputs, nn.Sequential(*layers)(obs).detach().numpy(), rtol=1e-4, atol=1e-5)
 
 
 def test_observations_of_other_kinds_and_shapes(layers):
