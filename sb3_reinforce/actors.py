@@ -21,8 +21,9 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.layers import Floats, actor_layers, lay_out
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, tells_values
+from sb3_reinforce.layers import actor_layers
+from sb3_reinforce.passes import Floats, lay_out
+from sb3_reinforce.policies import as_policy_actions, distribution_of, log_prob_and_entropy, tells_values
 from sb3_reinforce.rollouts import flatten
 
 # Actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
@@ -104,10 +105,9 @@ class LaidOutActor:
         :param actions: All actions, shape ``(n_steps, n_envs, action_dim)``
         :return: Shape ``(n_steps * n_envs,)``
         """
-        distribution, outputs = self.policy.action_dist, th.as_tensor(np.concatenate(self.outputs))
-        steps = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
-        log_std = [self.policy.log_std.cpu()] if isinstance(distribution, DiagGaussianDistribution) else []
-        return distribution.proba_distribution(outputs, *log_std).log_prob(steps).numpy()
+        outputs = th.as_tensor(np.concatenate(self.outputs), device=self.policy.device)
+        steps = as_policy_actions(th.as_tensor(actions).flatten(0, 1).to(outputs.device), self.policy.action_space)
+        return distribution_of(self.policy, outputs).log_prob(steps).cpu().numpy()
 
 
 def make_actor(policy: ActorCriticPolicy, n_envs: int, with_critic: bool) -> GeneralActor | LaidOutActor:
@@ -129,7 +129,7 @@ def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:
     The noise of each step, from PyTorch's generator.
 
     Gumbel noise ``−log E`` with E exponential for categorical actions, logistic ``log(u / (1 − u))`` for binary ones,
-    normal noise for Gaussian ones.
+    ``σ · normal`` for Gaussian ones.
 
     :param policy: The policy
     :param n_envs: Number of environments
@@ -138,7 +138,7 @@ def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:
     size = (max(1, NOISE_ROWS // n_envs), n_envs, cast(th.nn.Linear, policy.action_net).out_features)
     while True:
         if isinstance(policy.action_dist, DiagGaussianDistribution):
-            yield from th.randn(size).numpy()
+            yield from (th.randn(size) * policy.log_std.detach().exp().cpu()).numpy()
         elif isinstance(policy.action_dist, BernoulliDistribution):
             yield from th.rand(size).logit_().numpy()
         else:
@@ -156,8 +156,7 @@ def make_sampler(policy: ActorCriticPolicy) -> Callable[[Floats, Floats], np.nda
     """
     distribution = policy.action_dist
     if isinstance(distribution, DiagGaussianDistribution):
-        std = policy.log_std.detach().exp().cpu().numpy()
-        return lambda mean, normal: mean + std * normal
+        return np.add
     if isinstance(distribution, BernoulliDistribution):
         return lambda logits, logistic: (logits + logistic > 0).astype(np.float32)
     if isinstance(distribution, CategoricalDistribution):

@@ -10,12 +10,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import (
-    BernoulliDistribution,
-    CategoricalDistribution,
-    DiagGaussianDistribution,
-    MultiCategoricalDistribution,
-)
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor, NatureCNN
@@ -24,9 +19,8 @@ from torch.func import functional_call, vmap
 
 from sb3_reinforce import parameters
 from sb3_reinforce.collection import env_actions_of, shift_to_start
-from sb3_reinforce.policies import overrides
+from sb3_reinforce.layers import DISTRIBUTIONS, overrides
 
-DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
 # What an action goes through in ActorCriticPolicy; a policy with its own version of one of them is called as it is
 ACTION_METHODS = ("predict", "_predict", "get_distribution", "_get_action_dist_from_latent", "obs_to_tensor")
 

@@ -168,16 +168,5 @@ def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
     :param obs: Its observation
     :raises BadData: As ``check_observation``
     """
-    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
-    if (
-        type(obs) is np.ndarray
-        and rows is not None
-        and obs.shape == rows.shape[1:]
-        and obs.dtype == rows.dtype
-        and isinstance(env.observation_space, spaces.Box)
-    ):
-        # The check in short, for the most usual case
-        rows[i] = obs
-    else:
-        check_observation(env.observation_space, obs, i)
-        DummyVecEnv._save_obs(env, i, obs)
+    check_observation(env.observation_space, obs, i)
+    DummyVecEnv._save_obs(env, i, obs)

@@ -1,18 +1,7 @@
-"""
-Plain MLPs laid out as a few NumPy operations.
+"""Which policies are plain MLPs, so that ``passes`` computes what they would, and which have code of their own."""
 
-On a handful of observations PyTorch's modules take far longer than the arithmetic, and on thousands its tanh takes ten
-times as long as NumPy's.
-"""
-
-from collections.abc import Callable, Iterable
-from functools import reduce
-from typing import TypeAlias
-
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
@@ -23,17 +12,22 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 
-from sb3_reinforce.policies import overrides
-
-Floats: TypeAlias = NDArray[np.float32]
-
 # What a policy may have changed on the way from an observation to an action, or to V
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
 CRITIC_METHODS = ("forward", "extract_features", "predict_values")
 # What the noise of the laid-out actor can be turned into
 DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
-# Products beyond which NumPy's BLAS starts threads of its own, whatever number the user has set for PyTorch
-ONE_THREAD = 2**18
+
+
+def overrides(policy: ActorCriticPolicy, method: str) -> bool:
+    """
+    Whether the policy has its own version of a method, in its class or set on itself. A compiled policy has its own
+    ``forward``.
+
+    :param policy: The policy
+    :param method: Name of a method of ``ActorCriticPolicy``
+    """
+    return method in vars(policy) or getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
 
 
 def actor_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
@@ -85,7 +79,7 @@ def plain_layers(
 
 def is_plain_layer(layer: th.nn.Module) -> bool:
     """
-    Whether a layer is one that ``as_function`` knows.
+    Whether a layer is one that ``passes`` knows.
 
     :param layer: Any layer
     """
@@ -99,40 +93,3 @@ def is_changed(module: th.nn.Module) -> bool:
     :param module: Any module
     """
     return bool(module._forward_hooks or module._forward_pre_hooks) or "forward" in vars(module)
-
-
-def lay_out(layers: Iterable[th.nn.Module], n: int) -> Callable[[np.ndarray], Floats]:
-    """
-    The layers as one function of observations, with the parameters that they have now.
-
-    :param layers: ``Linear``, ``Tanh`` and ``ReLU`` layers
-    :param n: Number of observations at a time
-    :return: A function of arrays of shape ``(n, ...)``; returns shape ``(n, width)``
-    """
-    functions = [as_function(layer, n) for layer in layers]
-    return lambda obs: reduce(
-        lambda x, function: function(x), functions, obs.reshape(n, -1).astype(np.float32, copy=False)
-    )
-
-
-def as_function(layer: th.nn.Module, n: int) -> Callable[[Floats], Floats]:
-    """
-    A layer as a function of arrays of shape ``(n, n_in)``.
-
-    :param layer: ``Linear``, ``Tanh`` or ``ReLU``
-    :param n: Number of rows
-    """
-    if not isinstance(layer, th.nn.Linear):
-        return np.tanh if isinstance(layer, th.nn.Tanh) else lambda x: np.maximum(x, 0)
-    weight, bias = layer.weight.detach().T.contiguous().cpu(), layer.bias.detach().cpu()
-    if n * weight.numel() > ONE_THREAD:
-        return lambda x: th.addmm(bias, th.as_tensor(x), weight).numpy()
-    weights, biases = weight.numpy(), bias.numpy()
-
-    def affine(x: Floats) -> Floats:
-        # Shorter forms of the same, x @ weights + biases, are slower on a few rows
-        y: Floats = np.dot(x, weights)
-        y += biases
-        return y
-
-    return affine

@@ -12,8 +12,8 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.layers import actor_layers
-from sb3_reinforce.policies import Parameters, as_policy_actions, overrides
+from sb3_reinforce.layers import actor_layers, overrides
+from sb3_reinforce.policies import Parameters, as_policy_actions
 from sb3_reinforce.rollouts import Rollout, select
 
 # Steps that share a forward and a backward pass: what they leave behind is to stay in the cache

@@ -9,21 +9,14 @@ from typing import Any, TypeAlias
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_reinforce.layers import actor_layers, overrides
+from sb3_reinforce.passes import through
+
 Parameters: TypeAlias = list[th.nn.Parameter]
-
-
-def overrides(policy: ActorCriticPolicy, method: str) -> bool:
-    """
-    Whether the policy has its own version of a method, in its class or set on itself. A compiled policy has its own
-    ``forward``.
-
-    :param policy: The policy
-    :param method: Name of a method of ``ActorCriticPolicy``
-    """
-    return method in vars(policy) or getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
 
 
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
@@ -93,12 +86,27 @@ def evaluate(
     if has_own or (with_values and not has_parts(policy)):
         values, log_prob, entropy = policy.evaluate_actions(obs, actions)
     else:
-        distribution = policy.get_distribution(obs)
+        layers = actor_layers(policy)
+        if layers is None:
+            distribution = policy.get_distribution(obs)
+        else:
+            distribution = distribution_of(policy, through(layers, obs.flatten(1).float()))  # type: ignore[union-attr]
         log_prob, entropy = distribution.log_prob(actions), distribution.entropy()
         if with_values:
             values = policy.predict_values(obs)
     entropy = -log_prob if entropy is None else entropy
     return log_prob, entropy, values.flatten() if with_values and values is not None else None
+
+
+def distribution_of(policy: ActorCriticPolicy, outputs: th.Tensor) -> Distribution:
+    """
+    The distribution of actions of a policy whose actor is a plain MLP.
+
+    :param policy: The policy
+    :param outputs: What its last layer returns: logits, or means, shape ``(n, width)``
+    """
+    log_std = [policy.log_std] if isinstance(policy.action_dist, DiagGaussianDistribution) else []
+    return policy.action_dist.proba_distribution(outputs, *log_std)
 
 
 def split_parameters(

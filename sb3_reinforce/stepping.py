@@ -9,9 +9,9 @@ from copy import deepcopy
 from functools import partial
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
-from stable_baselines3.common.vec_env.util import dict_to_obs
 
 from sb3_reinforce.environment_checks import as_reward
 
@@ -40,19 +40,25 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     :raises BadData: If a reward is no number
     """
     env.step_async(actions)
-    infos = []
+    rewards, dones, infos = env.buf_rews, env.buf_dones, []
+    # The usual case, in which an array of this shape and kind needs no more checks
+    is_box = isinstance(env.observation_space, spaces.Box)
+    rows = next(iter(env.buf_obs.values()))
+    shape, dtype = rows.shape[1:], rows.dtype if is_box else None
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
-        env.buf_rews[i] = reward if type(reward) is float else as_reward(reward, i)
+        rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
-        env.buf_dones[i] = terminated or truncated
-        if terminated or truncated:
+        dones[i] = is_done = terminated or truncated
+        if is_done:
             env._save_obs(i, obs)
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        env._save_obs(i, obs)
+        if type(obs) is np.ndarray and obs.dtype is dtype and obs.shape == shape:
+            rows[i] = obs
+        else:
+            env._save_obs(i, obs)
         infos.append(info)
     env.buf_infos = infos
-    rows = {key: part.copy() for key, part in env.buf_obs.items()}
-    return dict_to_obs(env.observation_space, rows), env.buf_rews.copy(), env.buf_dones.copy(), infos.copy()
+    return rows.copy() if is_box else env._obs_from_buf(), rewards.copy(), dones.copy(), infos.copy()
