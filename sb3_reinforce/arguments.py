@@ -130,7 +130,7 @@ class CheckedSchedule(FloatSchedule):
             self(progress_remaining)
 
     def __call__(self, progress_remaining: float) -> float:
-        value = self.value_schedule(progress_remaining)
+        value: Any = self.value_schedule(progress_remaining)
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
         return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, self.above)
 

@@ -7,13 +7,14 @@ With 64 CartPoles these are a fourth of its time.
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_reinforce.environment_checks import as_reward
+from sb3_reinforce.environment_checks import as_reward, check_observation
 
 
 def stepper(env: VecEnv) -> Callable[[np.ndarray], VecEnvStepReturn]:
@@ -37,28 +38,29 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
 
     :param env: The environments
     :param actions: Shape ``(n_envs, ...)``
-    :raises BadData: If a reward is no number
+    :raises BadData: If a reward is no number, or the last observation of an episode malformed
     """
     env.step_async(actions)
     rewards, dones, infos = env.buf_rews, env.buf_dones, []
-    # The usual case, in which an array of this shape and kind needs no more checks
-    is_box = isinstance(env.observation_space, spaces.Box)
-    rows = next(iter(env.buf_obs.values()))
-    shape, dtype = rows.shape[1:], rows.dtype if is_box else None
+    # One array, unless observations are dicts
+    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
+    # The usual observation is written without asking further; to compare two shapes takes as long as all else here
+    is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
+    dtype, size = (rows.dtype, rows.shape[1]) if is_vector else (None, 0)
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
         dones[i] = is_done = terminated or truncated
         if is_done:
-            env._save_obs(i, obs)
+            check_observation(env.observation_space, obs, i)
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is np.ndarray and obs.dtype is dtype and obs.shape == shape:
+        if type(obs) is np.ndarray and obs.dtype is dtype and obs.ndim == 1 and obs.size == size:
             rows[i] = obs
         else:
             env._save_obs(i, obs)
         infos.append(info)
     env.buf_infos = infos
-    return rows.copy() if is_box else env._obs_from_buf(), rewards.copy(), dones.copy(), infos.copy()
+    return env._obs_from_buf() if rows is None else rows.copy(), rewards.copy(), dones.copy(), infos.copy()
