@@ -248,7 +248,7 @@ class FiniteDifference(Persistent):
             warnings.warn(
                 f"n_delta={n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters and "
                 "an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
-                stacklevel=3,
+                stacklevel=4,
             )
 
     def estimate_gradient(self, callback: BaseCallback) -> th.Tensor:

@@ -1,5 +1,6 @@
 """Saving a model, loading it and going on."""
 
+import pickle
 import random
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
@@ -27,7 +28,7 @@ class Persistent(BaseAlgorithm):
     Stable-Baselines3, and what its docstring says.
     """
 
-    _random_state: dict[str, Any]
+    _random_state: bytes
 
     def save(self, path: Place, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """
@@ -37,12 +38,10 @@ class Persistent(BaseAlgorithm):
         :param exclude: Attributes not to save, besides those that never are
         :param include: Attributes to save that otherwise are not
         """
-        self._random_state = {
-            "python": random.getstate(),
-            "numpy": np.random.get_state(),
-            "torch": th.get_rng_state(),
-            "cuda": th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None,
-        }
+        device = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
+        states = random.getstate(), np.random.get_state(), th.get_rng_state(), device
+        # As bytes, since Stable-Baselines3 would print each of their numbers into the file
+        self._random_state = pickle.dumps(states)
         with whole_or_not_at_all(path) as file:
             super().save(file, exclude, include)
 
@@ -83,12 +82,12 @@ class Persistent(BaseAlgorithm):
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         model = super().load(path, env, *args, **kwargs)
         if restore_random_state:
-            state = model._random_state
-            random.setstate(state["python"])
-            np.random.set_state(state["numpy"])
-            th.set_rng_state(state["torch"])
-            if state["cuda"] is not None and model.device.type == "cuda":
-                th.cuda.set_rng_state(state["cuda"], model.device)
+            python, numpy, torch, device = pickle.loads(model._random_state)
+            random.setstate(python)
+            np.random.set_state(numpy)
+            th.set_rng_state(torch)
+            if device is not None and model.device.type == "cuda":
+                th.cuda.set_rng_state(device, model.device)
         return model
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -46,7 +46,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
     # The usual observation is written without asking further; to compare two shapes takes as long as all else here
     is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
-    dtype, size = (rows.dtype, rows.shape[1]) if is_vector else (None, 0)
+    array, dtype, size = (np.ndarray, rows.dtype, rows.shape[1]) if is_vector else (None, None, 0)
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
@@ -57,7 +57,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is np.ndarray and obs.dtype is dtype and obs.ndim == 1 and obs.size == size:
+        if type(obs) is array and obs.dtype is dtype and obs.ndim == 1 and obs.size == size:
             rows[i] = obs
         else:
             env._save_obs(i, obs)

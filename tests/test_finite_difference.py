@@ -313,8 +313,9 @@ def test_a_policy_with_code_of_its_own_gives_the_same_and_says_that_it_is_slower
 
 def test_too_few_perturbations_for_a_regression_are_said_once() -> None:
     model = make(estimator="regression", n_delta=4)
-    with pytest.warns(UserWarning, match="n_delta=4 perturbations do not determine the gradient of 8"):
+    with pytest.warns(UserWarning, match="n_delta=4 perturbations do not determine the gradient of 8") as warned:
         model.learn(1)
+    assert warned[0].filename == __file__
     model.learn(1)
 
 
