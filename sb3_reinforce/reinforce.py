@@ -85,7 +85,8 @@ class REINFORCE(OnPolicyAlgorithm):
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
-    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. One that falls to 0
+        leaves a policy that is as good without its noise, as it is evaluated
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor
     :param max_episode_steps: With ``n_episodes``, the length beyond which an episode counts as one that never ends
