@@ -343,8 +343,9 @@ class REINFORCE(OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:
-            # Passes that moved the statistics of what the actor uses too would be a second step of the policy
-            self.policy.set_training_mode(not shared)
+            if shared:
+                # Passes that moved the statistics of what the actor uses too would be a second step of the policy
+                self.policy.set_training_mode(False)
             if self.policy.share_features_extractor:
                 self.policy.features_extractor.eval()
             update_learning_rate(self.critic_optimizer, critic_rate)
