@@ -115,7 +115,8 @@ class CheckedSchedule(FloatSchedule):
     :param name: Name of the argument, for the message
     :param schedule: A number, or a function of the progress that remains (from 1 to 0)
     :param low: Smallest allowed value
-    :param above: Exclude ``low`` itself
+    :param above: Exclude ``low`` itself, but not at the end of training (progress 0), when nothing is drawn any more:
+        a schedule may fall to it
     :param high: Largest allowed value
     :raises TypeError: If ``schedule`` is neither a number nor callable
     :raises ValueError: If its value at the start or at the end of training is not finite or not in the range
@@ -132,7 +133,8 @@ class CheckedSchedule(FloatSchedule):
     def __call__(self, progress_remaining: float) -> float:
         value: Any = self.value_schedule(progress_remaining)
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
-        return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, self.above)
+        above = self.above and progress_remaining > 0
+        return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, above)
 
 
 def check_basics(

@@ -1,5 +1,7 @@
 """Which policies are plain MLPs, so that ``passes`` computes what they would, and which have code of their own."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import (
@@ -17,6 +19,27 @@ ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action
 CRITIC_METHODS = ("forward", "extract_features", "predict_values")
 # What the noise of the laid-out actor can be turned into
 DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
+
+
+class DivideLogits:
+    """
+    ``π(a|s) ∝ exp(logits(s, a) / τ)``: a forward hook for the layer that makes the logits.
+
+    :param temperature: τ, a tensor without dimensions
+    """
+
+    def __init__(self, temperature: th.Tensor):
+        self.temperature = temperature
+
+    def __call__(self, module: th.nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
+        """
+        Divide the logits.
+
+        :param module: The layer
+        :param inputs: Its inputs
+        :param logits: Its output
+        """
+        return logits / self.temperature
 
 
 def overrides(policy: ActorCriticPolicy, method: str) -> bool:
@@ -88,8 +111,9 @@ def is_plain_layer(layer: th.nn.Module) -> bool:
 
 def is_changed(module: th.nn.Module) -> bool:
     """
-    Whether a module does something else than its class says.
+    Whether a module does something else than its class and its temperature say.
 
     :param module: Any module
     """
-    return bool(module._forward_hooks or module._forward_pre_hooks) or "forward" in vars(module)
+    own_hooks = [hook for hook in module._forward_hooks.values() if not isinstance(hook, DivideLogits)]
+    return bool(own_hooks or module._forward_pre_hooks) or "forward" in vars(module)

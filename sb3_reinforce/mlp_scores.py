@@ -28,10 +28,11 @@ def factored_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     The actor's layers, if the scores of its parameters have factors.
 
     :param policy: The policy
-    :return: As ``actor_layers``; None also where ``evaluate_actions`` is overridden or two layers share a parameter
+    :return: As ``actor_layers``; None also where ``evaluate_actions`` is overridden, two layers share a parameter, or a
+        temperature comes after a layer
     """
     layers = actor_layers(policy)
-    if layers is None or overrides(policy, "evaluate_actions"):
+    if layers is None or overrides(policy, "evaluate_actions") or any(layer._forward_hooks for layer in layers):
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
     return layers if len(set(parameters)) == len(parameters) else None

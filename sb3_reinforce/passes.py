@@ -66,13 +66,15 @@ def above_ones(width: int, n: int) -> Floats:
 
 def product(layer: th.nn.Linear, x: Floats, out: Floats) -> Callable[[], Any]:
     """
-    ``[W b] x`` as a function of what stands in x when it is called.
+    ``[W b] x``, over τ where the layer has a temperature, as a function of what stands in x when it is called.
 
     :param layer: W and b
     :param x: Shape ``(n_in + 1, n)``
     :param out: Where to write, shape ``(n_out, n)``
     """
-    weights = th.cat([layer.weight.detach(), layer.bias.detach()[:, None]], dim=1).cpu()
+    weights = th.cat([layer.weight.detach(), layer.bias.detach()[:, None]], dim=1)
+    for divide in layer._forward_hooks.values():
+        weights = divide(layer, None, weights)
     if x.shape[1] * weights.numel() > ONE_THREAD:
         return partial(th.mm, weights, th.from_numpy(x), out=th.from_numpy(out))
     return partial(np.dot, weights.numpy(), x, out)

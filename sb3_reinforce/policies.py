@@ -13,7 +13,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.layers import actor_layers, overrides
+from sb3_reinforce.layers import DivideLogits, actor_layers, overrides
 from sb3_reinforce.passes import through
 
 Parameters: TypeAlias = list[th.nn.Parameter]
@@ -144,25 +144,8 @@ def reached(output: th.Tensor, parameters: Parameters) -> list[bool]:
     return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
 
 
-class DivideLogits:
-    """
-    ``π(a|s) ∝ exp(logits(s, a) / τ)``: a forward hook for the layer that makes the logits.
-
-    :param temperature: τ, a tensor without dimensions
-    """
-
-    def __init__(self, temperature: th.Tensor):
-        self.temperature = temperature
-
-    def __call__(self, module: th.nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
-        """
-        Divide the logits.
-
-        :param module: The layer
-        :param inputs: Its inputs
-        :param logits: Its output
-        """
-        return logits / self.temperature
+# The logits of float32 networks at this temperature leave one action
+MIN_TEMPERATURE = 1e-3
 
 
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
@@ -170,7 +153,7 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     From now on the policy acts and is evaluated at a temperature. ``policy.save`` does not keep it, a model's does.
 
     :param policy: A policy over discrete actions
-    :param temperature: τ
+    :param temperature: τ; below ``MIN_TEMPERATURE`` this stands for it, so that a schedule may fall to 0
     :raises ValueError: If τ is not 1 and the policy has no ``action_net``
     """
     layer = getattr(policy, "action_net", None)
@@ -181,7 +164,7 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
         hooks = [DivideLogits(th.ones((), device=policy.device))]
         layer.register_forward_hook(hooks[0])
     for hook in hooks:
-        hook.temperature.fill_(temperature)
+        hook.temperature.fill_(max(temperature, MIN_TEMPERATURE))
 
 
 @th.no_grad()

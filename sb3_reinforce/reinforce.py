@@ -96,7 +96,8 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
-    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. One that falls to 0
+        leaves a policy that is as good without its noise, as it is evaluated
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor
     :param max_episode_steps: With ``n_episodes``, the length beyond which an episode counts as one that never ends
@@ -355,8 +356,9 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:
-            # Passes that moved the statistics of what the actor uses too would be a second step of the policy
-            self.policy.set_training_mode(not shared)
+            if shared:
+                # Passes that moved the statistics of what the actor uses too would be a second step of the policy
+                self.policy.set_training_mode(False)
             if self.policy.share_features_extractor:
                 self.policy.features_extractor.eval()
             update_learning_rate(self.critic_optimizer, critic_rate)

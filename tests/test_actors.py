@@ -64,13 +64,14 @@ def test_actions_are_drawn_from_the_policys_distribution(space, actor):
     assert (scores.std(0) > 0).all()
 
 
-@pytest.mark.parametrize("space", SPACES, ids=str)
-def test_both_give_the_same_log_probabilities(space):
-    policy = make_policy(space)
+@pytest.mark.parametrize(("space", "kwargs"), [*((space, {}) for space in SPACES), (SPACES[0], {"temperature": 0.3})])
+def test_both_give_the_same_log_probabilities(space, kwargs):
+    policy = make_policy(space, **kwargs)
     obs = np.random.default_rng(0).normal(size=(6, 3, 5)).astype(np.float32)
     laid_out, general = LaidOutActor(policy, actor_layers(policy), 3), GeneralActor(policy, False)
     actions = np.stack([laid_out.act(row)[0].reshape(3, -1) for row in obs])
-    np.testing.assert_allclose(laid_out.log_prob(obs, actions), general.log_prob(obs, actions), rtol=1e-5)
+    # Where log π is near 0, what is left is the rounding of logits of order 1
+    np.testing.assert_allclose(laid_out.log_prob(obs, actions), general.log_prob(obs, actions), rtol=1e-5, atol=1e-6)
 
 
 def test_noise_is_that_of_its_distribution():
@@ -194,7 +195,6 @@ def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
 
 def test_whatever_is_not_plain_goes_the_general_way():
     assert actor_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
-    assert actor_layers(make_policy(temperature=0.5)) is None
     assert actor_layers(make_policy(SPACES[3], use_sde=True)) is None
     assert actor_layers(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
     assert actor_layers(th.compile(make_policy(), backend="eager")) is None

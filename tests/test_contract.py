@@ -367,6 +367,21 @@ def test_temperature_divides_the_logits(env_id):
     th.testing.assert_close(outcomes[0], outcomes[1])
 
 
+def test_temperature_may_fall_to_zero(tmp_path):
+    """As "linearly to 0" does: the last policy is its own mode, and a model loaded at the end is that too."""
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, temperature=LinearSchedule(1.0, 0.0, 1.0), device="cpu")
+    with th.no_grad():
+        model.policy.action_net.weight.normal_()
+    model.learn(320)
+    model.save(tmp_path / "cold")
+    cold = REINFORCE.load(tmp_path / "cold", env=model.env)
+    obs = th.randn(200, 4).numpy()
+    sampled, mode = (cold.predict(obs, deterministic=deterministic)[0] for deterministic in (False, True))
+    assert len(set(mode)) == 2 and (sampled == mode).all()
+    cold.learn(64)
+    assert all(parameter.isfinite().all() for parameter in cold.policy.parameters())
+
+
 def test_min_std_is_a_floor():
     model = REINFORCE(
         "MlpPolicy", "Pendulum-v1", n_steps=16, min_std=0.6, learning_rate=0.5, policy_kwargs={"log_std_init": -3.0}

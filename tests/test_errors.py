@@ -59,6 +59,12 @@ def test_a_schedule_that_returns_nonsense_is_named(name, schedule):
         REINFORCE("MlpPolicy", "CartPole-v1", **{name: schedule})
 
 
+@pytest.mark.parametrize("schedule", [lambda progress: 0.0, lambda progress: 1 - progress])
+def test_a_schedule_may_fall_to_an_excluded_bound_but_not_begin_there(schedule):
+    with pytest.raises(ValueError, match=r"temperature \(at progress 1\) must be finite and > 0"):
+        REINFORCE("MlpPolicy", "CartPole-v1", temperature=schedule)
+
+
 def test_a_schedule_that_goes_wrong_later_stops_training_before_a_step():
     model = REINFORCE(
         "MlpPolicy", "CartPole-v1", n_steps=8, learning_rate=lambda progress: NAN if 0 < progress < 0.6 else 1e-3

@@ -198,10 +198,11 @@ def test_the_buffer_is_that_of_a2c():
 
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
-@pytest.mark.parametrize("temperature", [1.0, 0.5])
-def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature, monkeypatch):
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
+def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_fn, monkeypatch):
     """The laid-out actor asks the policy nothing; the general one takes one pass more, for all log-probabilities."""
-    model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, temperature=temperature)
+    policy_kwargs = {"activation_fn": activation_fn}
+    model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, policy_kwargs=policy_kwargs)
     calls = {"get_distribution": 0, "predict_values": 0}
     for name in calls:
         original = getattr(ActorCriticPolicy, name)
@@ -213,7 +214,7 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, temperature
         monkeypatch.setattr(ActorCriticPolicy, name, counted)
     _, callback = model._setup_learn(1)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, None)
-    assert calls["get_distribution"] == (0 if temperature == 1 else model.rollout_buffer.size() + 1)
+    assert calls["get_distribution"] == (0 if activation_fn is th.nn.Tanh else model.rollout_buffer.size() + 1)
     assert calls["predict_values"] <= (3 if baseline == "value" else 0)
 
 

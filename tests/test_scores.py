@@ -88,8 +88,8 @@ class OutOfMemory(ActorCriticPolicy):
 
 
 def test_an_error_of_the_policy_is_not_taken_for_one_that_cannot_be_traced(monkeypatch):
-    rollout = collect(Corridor((2, 9)))
-    rollout = replace(rollout, policy=REINFORCE(OutOfMemory, Corridor((2, 9)), device="cpu").policy)
+    rollout = collect(Corridor((7, 9)))
+    rollout = replace(rollout, policy=REINFORCE(OutOfMemory, Corridor((7, 9)), device="cpu").policy)
     monkeypatch.setattr(scores, "episode_gradients", None)
     with pytest.raises(th.OutOfMemoryError, match="no memory"):
         gradients_by_episode(rollout, rollout.returns)
