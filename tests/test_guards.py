@@ -318,6 +318,16 @@ def test_a_worker_that_goes_wrong_is_named_with_its_exception(fault, start_metho
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_the_only_worker_dies():
+    """Nobody else holds its end of the pipe open then."""
+    env = SubprocVecEnv([lambda: Faulty(fault="die in step", at=2)], start_method="fork")
+    with pytest.raises(ConnectionError, match="worker of environment 0 died: it was killed by SIGKILL"):
+        make("steps", env).learn(24)
+    env.close()
+    assert env.closed
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_worker_that_died_between_two_runs():
     """The plain VecEnv would wait for ever in its reset, and in a call of a callback."""
     env = of_three("fork")
@@ -427,7 +437,10 @@ def test_learning_within_a_callback(kind):
     """What another model has done with the same environments leaves them guarded."""
     env = VecNormalize(of_two(fault="reward", at=40, value=NAN))
     other = make("steps", env)
+    bases = []
+    look = Once(lambda model: bases.append(env.venv.venv))
     with pytest.raises(ValueError, match="reward of environment 1 is not finite"):
-        make(kind, env).learn(400, callback=Once(lambda model: other.learn(16)))
-    assert other.num_timesteps == 16 and type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
+        make(kind, env).learn(400, callback=Once(lambda model: other.learn(24, callback=look)))
+    assert len(bases) == 1 and type(bases[0]) is DummyVecEnv
+    assert other.num_timesteps == 32 and type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
     assert all(np.isfinite(part).all() for part in statistics(env))
