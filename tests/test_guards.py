@@ -433,13 +433,14 @@ def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
 
 
 @all_kinds
-def test_learning_within_a_callback(kind):
+@pytest.mark.parametrize("fault", ["reward", "observation"])
+def test_learning_within_a_callback(fault, kind):
     """What another model has done with the same environments leaves them guarded."""
-    env = VecNormalize(of_two(fault="reward", at=40, value=NAN))
+    env = VecNormalize(of_two(fault=fault, at=40, value=NAN if fault == "reward" else np.zeros(1)))
     other = make("steps", env)
     bases = []
     look = Once(lambda model: bases.append(env.venv.venv))
-    with pytest.raises(ValueError, match="reward of environment 1 is not finite"):
+    with pytest.raises(ValueError, match=f"The {fault} of environment 1"):
         make(kind, env).learn(400, callback=Once(lambda model: other.learn(24, callback=look)))
     assert len(bases) == 1 and type(bases[0]) is DummyVecEnv
     assert other.num_timesteps == 32 and type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
