@@ -63,30 +63,32 @@ def watched(env: VecEnv | None) -> Iterator[None]:
         while isinstance(env, VecEnvWrapper):
             wrappers.append(env)
             env = env.venv
-        if wrappers and not isinstance(wrappers[-1], Guard):
-            lowest = wrappers[-1]
-            lowest.venv = Guard(lowest.venv, any(isinstance(wrapper, VecNormalize) for wrapper in wrappers))
-            stack.callback(setattr, lowest, "venv", base)
+        if wrappers and not isinstance(env, Guard):
+            guard = Guard(cast(VecEnv, env), any(isinstance(wrapper, VecNormalize) for wrapper in wrappers))
+            wrappers[-1].venv = cast(VecEnv, guard)
+            stack.callback(setattr, wrappers[-1], "venv", env)
         yield
 
 
-class Guard(VecEnvWrapper):
+class Guard:
     """
-    The lowest wrapper of environments while a model learns: names what is malformed, steps a ``DummyVecEnv`` without
-    its deep copies, and refuses numbers that are not finite.
+    Stands for environments below their wrappers while a model learns: names what is malformed, steps a ``DummyVecEnv``
+    without its deep copies, and refuses numbers that are not finite.
+
+    No ``VecEnvWrapper``, since ``EvalCallback`` compares those of its environment with those of the model's.
 
     :param venv: The environments
     :param has_statistics: Whether a wrapper above it keeps statistics; if not, the algorithm checks the numbers itself
     """
 
     def __init__(self, venv: VecEnv, has_statistics: bool):
-        super().__init__(venv)
-        self._has_statistics, self._step, self._guarded_actions = has_statistics, stepper(venv), np.empty(0)
+        self.venv, self.has_statistics, self.step = venv, has_statistics, stepper(venv)
+        self.actions = np.empty(0)
 
     def reset(self) -> VecEnvObs:
         """Reset the environments."""
         obs = self.venv.reset()
-        if self._has_statistics:
+        if self.has_statistics:
             check_finite("The observation", obs, (None,))
         return obs
 
@@ -96,17 +98,20 @@ class Guard(VecEnvWrapper):
 
         :param actions: Shape ``(n_envs, ...)``
         """
-        self._guarded_actions = actions
+        self.actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step."""
-        obs, rewards, dones, infos = self._step(self._guarded_actions)
-        if self._has_statistics:
+        obs, rewards, dones, infos = self.step(self.actions)
+        if self.has_statistics:
             check_finite("The reward", rewards, (None,))
             check_finite("The observation", obs, (None,))
             for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
                 check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
         return obs, rewards, dones, infos
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.venv, name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy of the environments is not guarded
