@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("matplotlib")
 
+import gymnasium as gym
 import rl_zoo3
 import torch as th
 import yaml
@@ -65,6 +66,20 @@ def test_record_video(name: str, folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("pygame")
     zoo("record_video", "--algo", name, "-f", "logs", "--exp-id", "1", "-n", "20", "-o", str(tmp_path))
     assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+
+
+def test_record_video_takes_environments_of_other_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame")
+    (tmp_path / "own_envs.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('Own-v0', 'gymnasium.envs.classic_control.cartpole:CartPoleEnv', max_episode_steps=50)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    common = ("--algo", "reinforce", "--env", "Own-v0", "--gym-packages", "own_envs", "-f", str(tmp_path), "-n", "40")
+    zoo("train", *common)
+    zoo("record_video", *common, "-o", str(tmp_path / "videos"))
+    gym.registry.pop("Own-v0")
+    assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 
 
 @pytest.mark.parametrize("name", NAMES)
