@@ -71,8 +71,8 @@ def test_settings_of_another_version_and_of_tasks_no_search_has_any_for() -> Non
     assert compare.settings_of("ppo", "Hopper-v5")["gamma"] == 0.999
     assert compare.settings_of("ars", "Hopper-v5")["alive_bonus_offset"] == -1
     assert compare.settings_of("finite_difference", "FrozenLake-v1") is None
-    model, env, eval_env = compare.make(compare.Run("FrozenLake-v1", "reinforce", 0, 600))
-    assert model.learn(64).num_timesteps >= 64 and env.num_envs == 8 and eval_env.num_envs == 10
+    model = compare.make(compare.Run("FrozenLake-v1", "reinforce", 0, 600))[0]
+    assert model.learn(64).num_timesteps >= 64
 
 
 def test_settings_of_an_atari_game() -> None:
