@@ -349,7 +349,7 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
         (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
         (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
         (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
-        (dict(delta_std=lambda progress: progress), ValueError, "delta_std .at progress 0. must be finite and > 0"),
+        (dict(delta_std=lambda progress: 1 - progress), ValueError, "delta_std .at progress 1. must be finite and > 0"),
         (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
         (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
         (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0, got -1"),
