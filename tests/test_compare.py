@@ -1,15 +1,22 @@
 """The comparison script: what its rows say is what happened, and a run is made once."""
 
 import importlib.util
+import json
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import pytest
 
 pytest.importorskip("rl_zoo3")
 pandas = pytest.importorskip("pandas")
+
+import yaml
+from stable_baselines3.common.policies import ActorCriticCnnPolicy
+
+from sb3_reinforce.zoo import HYPERPARAMS, experiments
 
 BENCHMARKS = Path(__file__).parent.parent / "examples" / "benchmarks"
 # The Zoo and what it calls warn of their own affairs
@@ -63,14 +70,38 @@ def test_runs_share_no_policy_kwargs() -> None:
 def test_settings_of_another_version_and_of_tasks_no_search_has_any_for() -> None:
     assert compare.settings_of("ppo", "Hopper-v5")["gamma"] == 0.999
     assert compare.settings_of("ars", "Hopper-v5")["alive_bonus_offset"] == -1
-    assert compare.settings_of("finite_difference", "Taxi-v3") is None
-    assert compare.settings_of("reinforce", "Taxi-v3")["policy"] == "MlpPolicy"
+    assert compare.settings_of("finite_difference", "FrozenLake-v1") is None
+    model = compare.make(compare.Run("FrozenLake-v1", "reinforce", 0, 600))[0]
+    assert model.learn(64).num_timesteps >= 64
+
+
+def test_settings_of_an_atari_game() -> None:
+    pytest.importorskip("ale_py")
+    assert [bool(compare.settings_of(name, "ALE/Pong-v5")) for name in compare.ALGORITHMS] == [1, 0, 1, 1, 0]
+    run = compare.Run("ALE/Pong-v5", "reinforce", 0, 600)
+    model, env, eval_env = compare.make(run)
+    assert isinstance(model.policy, ActorCriticCnnPolicy)
+    evaluations = compare.Evaluations(run, env, eval_env)
+    evaluations.model = model
+    env.step(model.predict(env.reset())[0])
+    model.num_timesteps += env.num_envs
+    # A step is four frames, which the environments count, and a game starts with some that nobody plays
+    assert evaluations.steps() == env.num_envs < sum(env.get_attr("total_steps")) / 4
+
+
+def test_models_are_built_of_what_the_command_train_would_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    default = {"policy": "MlpPolicy", "n_timesteps": 64, "temperature": "lin_1", "ent_coef": "lin_0.1"}
+    (tmp_path / "reinforce.yml").write_text(json.dumps({"default": default}))
+    monkeypatch.setattr(experiments, "HYPERPARAMS", tmp_path)
+    model = compare.make(compare.Run("CartPole-v1", "reinforce", 0, 600))[0]
+    assert model.temperature(0.25) == 0.25 and model.ent_coef(0.5) == 0.05
+    assert compare.make(compare.Run("Pendulum-v1", "reinforce", 0, 600))[0].temperature == 1.0
 
 
 def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    output = tmp_path / "results.csv"
+    output = tmp_path / "made" / "results.csv"
     command = [sys.executable, str(BENCHMARKS / "compare.py"), "--tasks", "CartPole-v1", "--timesteps", "200"]
     command += ["--algorithms", "reinforce", "a2c", "--seeds", "0", "1", "--final-episodes", "10", "--processes", "1"]
     command += ["--output", str(output)]
@@ -88,3 +119,45 @@ def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(
     assert {path.name for path in tmp_path.glob("*.png")} == {"picture_curves.png", "picture_summary.png"}
     median = final[final["algorithm"] == "reinforce"]["return"].median()
     assert f"| CartPole-v1 (200) | REINFORCE | 2 | {median:.1f} (" in capsys.readouterr().out
+
+
+def test_a_task_that_is_not_registered_is_named_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with mock.patch.object(sys, "argv", ["compare.py", "--tasks", "Nope-v5", "--output", str(tmp_path / "r.csv")]):
+        with pytest.raises(SystemExit):
+            compare.main()
+    assert "--tasks: Nope-v5 not registered" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("missing", "sentence", "drawn"),
+    [
+        ([("reinforce", "CartPole-v1"), ("reinforce", "Reacher-v5")], "No probability of improvement", {"a2c", "ppo"}),
+        ([("reinforce", "Reacher-v5")], "REINFORCE (seed 0), REINFORCE (seed 1)", {"a2c", "ppo"}),
+        ([("a2c", "Reacher-v5")], "A2C (seed 0), A2C (seed 1)", {"reinforce", "ppo"}),
+    ],
+)
+def test_a_summary_says_what_it_leaves_out(
+    missing: list[tuple[str, str]], sentence: str, drawn: set[str], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    pytest.importorskip("rliable")
+    plots = load("compare_plots")
+    monkeypatch.setattr(plots, "REPETITIONS", 20)
+    rows = [
+        {"task": task, "budget": 9, "algorithm": name, "seed": seed, "evaluation": "final", "return": -5.0 * seed}
+        for name in ("reinforce", "a2c", "ppo")
+        for task in ("CartPole-v1", "Reacher-v5")
+        for seed in (0, 1)
+        if (name, task) not in missing
+    ]
+    scores = plots.final_scores(pandas.DataFrame(rows))
+    plots.draw_summary(scores)
+    assert set(scores) == drawn and sentence in capsys.readouterr().out
+    assert plots.plt.gcf().axes[2].axison == ("reinforce" in drawn)
+    plots.plt.close("all")
+
+
+def test_every_task_with_settings_has_a_reference() -> None:
+    pytest.importorskip("rliable")
+    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
+    assert load("compare_plots").REFERENCES.keys() >= published.keys() - {"default", "atari"}

@@ -350,6 +350,7 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
         (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
         (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
         (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
+        (dict(delta_std=lambda progress: 1 - progress), ValueError, "delta_std .at progress 1. must be finite and > 0"),
         (
             dict(delta_std=lambda progress: 2 * progress - 1),
             ValueError,

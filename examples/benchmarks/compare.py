@@ -8,17 +8,16 @@ RL Zoo publishes (those of another version of the task where it has none for thi
 ``sb3_reinforce.zoo``; the two searches are run only on tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
-the budget, and at the end on ``--final-episodes``. ``steps`` are counted by the environments, since ARS counts some of
-its more than once; ``seconds`` are those of training, without the evaluations, and ``cpu_seconds`` the same as the
-process's own clock counts them, which a busy machine does not stretch. The rows of a run are written when it is
-finished, and runs that are there already are not repeated: stop the script when you like and start it again.
+the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
+``cpu_seconds`` the same by the process's own clock, which a busy machine does not stretch. The rows of a run are
+written when it is finished, and a run that is there is not repeated: stop the script when you like and start it again.
 """
 
 import argparse
 import contextlib
-import csv
 import functools
 import io
+import itertools
 import multiprocessing
 import re
 import signal
@@ -27,7 +26,9 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
+import pandas as pd
 import rl_zoo3
 import torch as th
 import yaml
@@ -37,6 +38,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS
 
 ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "ars")
@@ -47,7 +49,6 @@ BUDGETS = {
 OTHER_BUDGET = 1_000_000
 N_EVALUATIONS = 20
 EVALUATION_EPISODES = 10
-N_EVAL_ENVS = 10
 COLUMNS = (
     "task", "algorithm", "seed", "budget", "evaluation", "steps", "seconds", "cpu_seconds", "return", "return_std",
     "episodes",
@@ -64,16 +65,13 @@ class Run(NamedTuple):
 
 
 def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
-    """The settings published for a task, its latest other version, or any task; None where a search has none."""
-    ours = HYPERPARAMS / f"{algorithm}.yml"
-    path = ours if ours.exists() else Path(rl_zoo3.__file__).parent / "hyperparams" / ours.name
-    published = yaml.safe_load(path.read_text())
-    if task in published:
-        return published[task]
-    versions = [int(key.split("-v")[1]) for key in published if re.fullmatch(rf"{task.split('-v')[0]}-v\d+", key)]
-    if versions:
-        return published[f"{task.split('-v')[0]}-v{max(versions)}"]
-    return None if algorithm in SEARCHES else published["default"]
+    """The settings published for a task, its latest other version (peers), or any task; None where there are none."""
+    folder = HYPERPARAMS if algorithm in OURS else Path(rl_zoo3.__file__).parent / "hyperparams"
+    published = yaml.safe_load((folder / f"{algorithm}.yml").read_text())
+    version = re.compile(re.escape(task.split("-v")[0]) + r"-v\d+")
+    others = [] if algorithm in OURS else sorted(filter(version.fullmatch, published), reverse=True)
+    general = [] if algorithm in SEARCHES else ["atari" if ExperimentManager.is_atari(task) else "default"]
+    return next((published[key] for key in (task, *others, *general) if key in published), None)
 
 
 def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
@@ -82,13 +80,13 @@ def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
         manager = ExperimentManager(
             argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
         )
-        kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(
-            dict(settings_of(run.algorithm, run.task))
-        )
+        # Ours are read as by the command train, which leaves out what does not go with the task
+        settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
+        kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
         env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
         # The same starts for all algorithms, other than those of the training
         manager.seed = 10_000 + run.seed
-        eval_env = manager.create_envs(N_EVAL_ENVS, eval_env=True)
+        eval_env = manager.create_envs(EVALUATION_EPISODES, eval_env=True)
     return rl_zoo3.ALGOS[run.algorithm](env=env, seed=run.seed, device="cpu", **kwargs), env, eval_env
 
 
@@ -110,18 +108,21 @@ class Evaluations(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
+    def steps(self) -> int:
+        """ARS counts some of its steps more than once; environments count each frame that an Atari game skips."""
+        return sum(self.env.get_attr("total_steps")) if self.run.algorithm == "ars" else self.model.num_timesteps
+
     def _on_rollout_start(self) -> None:
-        twentieth = sum(self.env.get_attr("total_steps")) * N_EVALUATIONS // self.run.budget
+        twentieth = self.steps() * N_EVALUATIONS // self.run.budget
         if twentieth >= self.twentieth:
             self.evaluate("training", EVALUATION_EPISODES)
             self.twentieth = twentieth + 1
 
     def evaluate(self, evaluation: str, episodes: int) -> None:
         self.spent += clocks() - self.since
-        steps = sum(self.env.get_attr("total_steps"))
         sync_envs_normalization(self.env, self.eval_env)
         mean, std = evaluate_policy(self.model, self.eval_env, episodes)
-        row = (*self.run, evaluation, steps, *self.spent.round(2), round(mean, 3), round(std, 3), episodes)
+        row = (*self.run, evaluation, self.steps(), *self.spent.round(2), round(mean, 3), round(std, 3), episodes)
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self.since = clocks()
 
@@ -148,11 +149,10 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
     return run, evaluations.rows
 
 
-def finished(path: Path) -> set[Run]:
+def finished(path: Path) -> set[tuple[Any, ...]]:
     """The runs that a CSV has the last row of."""
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["evaluation"] == "final"]
-    return {Run(row["task"], row["algorithm"], int(row["seed"]), int(row["budget"])) for row in rows}
+    rows = pd.read_csv(path)
+    return set(rows.loc[rows["evaluation"] == "final", list(Run._fields)].itertuples(index=False, name=None))
 
 
 def main() -> None:
@@ -165,36 +165,32 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--output", type=Path, required=True, help="the CSV; rows are added to it")
     arguments = parser.parse_args()
+    if unknown := set(arguments.tasks) - gym.registry.keys():
+        parser.error(f"--tasks: {', '.join(unknown)} not registered in Gymnasium")
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     if not arguments.output.exists():
         arguments.output.write_text(",".join(COLUMNS) + "\n")
-    runs = [
+    wanted = [
         Run(task, algorithm, seed, arguments.timesteps or BUDGETS.get(task, OTHER_BUDGET))
-        for seed in arguments.seeds
-        for task in arguments.tasks
-        for algorithm in arguments.algorithms
-        if settings_of(algorithm, task) is not None
+        for seed, task, algorithm in itertools.product(arguments.seeds, arguments.tasks, arguments.algorithms)
+        if settings_of(algorithm, task)
     ]
-    done = finished(arguments.output)
-    runs = [run for run in runs if run not in done]
+    runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index)
     if not runs:
-        raise SystemExit(f"Nothing to do: {arguments.output} has these runs already")
+        raise SystemExit(f"Nothing to do: {arguments.output} has the {len(wanted)} runs that there are settings for")
     failed, start = [], time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
         results = pool.imap_unordered(functools.partial(train, arguments.final_episodes), runs)
         for number, (run, outcome) in enumerate(results, 1):
             minutes = (time.perf_counter() - start) / 60
             left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"
-            name = f"{run.task} {run.algorithm} seed {run.seed}"
             if isinstance(outcome, Exception):
-                failed.append(f"{name}: {outcome!r}")
-                print(left, failed[-1], flush=True)
-                continue
-            text = io.StringIO()
-            csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(outcome)
-            with arguments.output.open("a") as file:
-                file.write(text.getvalue())
-            last = outcome[-1]
-            print(left, f"{name}: {last['return']:.1f}, {last['steps']} steps, {last['seconds']:.0f} s", flush=True)
+                result = repr(outcome)
+                failed.append(f"{run}: {result}")
+            else:
+                pd.DataFrame(outcome).to_csv(arguments.output, mode="a", header=False, index=False)
+                result = "{return:.1f}, {steps} steps, {seconds:.0f} s".format(**outcome[-1])
+            print(left, f"{run.task} {run.algorithm} seed {run.seed}: {result}", flush=True)
     if failed:
         raise SystemExit("Failed:\n" + "\n".join(failed))
 

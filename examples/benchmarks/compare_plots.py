@@ -40,6 +40,9 @@ REFERENCES = {
     "Walker2d-v5": (1.8, 3479.0),
     "Swimmer-v5": (0.8, 282.0),
     "Ant-v5": (-48.0, 1327.0),
+    # Which benchmark.md does not have: PPO at 1M steps in Tianshou's examples/mujoco/README.md, on version 2
+    "InvertedPendulum-v5": (5.2, 1000.0),
+    "Reacher-v5": (-43.3, -4.1),
 }
 
 
@@ -76,7 +79,7 @@ def color(algorithm: str) -> str:
 
 
 def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Normalized final returns of each algorithm that was run on every task, shape ``(n_runs, n_tasks)``."""
+    """Normalized final returns of each algorithm, of the seeds run on every task, shape ``(n_runs, n_tasks)``."""
     final = results[results["evaluation"] == "final"].copy()
     unknown = set(final["task"]) - REFERENCES.keys()
     if unknown:
@@ -84,7 +87,11 @@ def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
     low, high = np.array([REFERENCES[task] for task in final["task"]]).T
     final["return"] = (final["return"] - low) / (high - low)
     table = final.pivot_table(index=["algorithm", "seed"], columns=["task", "budget"], values="return", sort=False)
-    return {name: runs.to_numpy() for name, runs in table.dropna().groupby("algorithm", sort=False)}
+    complete = table.dropna()
+    left_out = [f"{LABELS.get(name, name)} (seed {seed})" for name, seed in table.index.difference(complete.index)]
+    if left_out:
+        print("Left out of the summary, which needs a run on every task:", ", ".join(left_out))
+    return {name: runs.to_numpy() for name, runs in complete.groupby("algorithm", sort=False)}
 
 
 def draw_summary(scores: dict[str, np.ndarray]) -> None:
@@ -99,12 +106,15 @@ def draw_summary(scores: dict[str, np.ndarray]) -> None:
         middle.fill_between(thresholds, *bands[name], color=color(name), alpha=0.2, linewidth=0)
     middle.set(xlabel="normalized return τ", ylabel="share of runs above τ")
     middle.legend(frameon=False, fontsize="small")
-    others = {name: (scores["reinforce"], score) for name, score in scores.items() if name != "reinforce"}
-    if others:
-        chances, spans = library.get_interval_estimates(others, metrics.probability_of_improvement, reps=REPETITIONS)
-        draw_intervals(right, chances, spans)
-        right.axvline(0.5, color="grey", linestyle=":")
-        right.set(xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
+    others = {name: (scores.get("reinforce"), score) for name, score in scores.items() if name != "reinforce"}
+    if "reinforce" not in scores or not others:
+        print("No probability of improvement: it needs REINFORCE and another algorithm on every task")
+        right.set_axis_off()
+        return
+    chances, spans = library.get_interval_estimates(others, metrics.probability_of_improvement, reps=REPETITIONS)
+    draw_intervals(right, chances, spans)
+    right.axvline(0.5, color="grey", linestyle=":")
+    right.set(xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
 
 
 def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[str, np.ndarray]) -> None:
@@ -149,7 +159,10 @@ def main() -> None:
     print(table(results, arguments.clock))
     draw_curves(results, arguments.clock)
     plt.savefig(arguments.output.with_name(f"{arguments.output.name}_curves.png"), dpi=120)
-    draw_summary(final_scores(results))
+    scores = final_scores(results)
+    if not scores:
+        raise SystemExit("No algorithm was run on every task: there is no summary to draw")
+    draw_summary(scores)
     plt.savefig(arguments.output.with_name(f"{arguments.output.name}_summary.png"), dpi=120)
 
 

@@ -13,11 +13,12 @@ except ImportError as error:
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_reinforce.zoo import samplers
-from sb3_reinforce.zoo.configuration import ALGORITHMS, HYPERPARAMS, read_ours_too
+from sb3_reinforce.zoo.configuration import ALGORITHMS, HYPERPARAMS
+from sb3_reinforce.zoo.experiments import extend_experiments
 
 __all__ = ["ALGORITHMS", "HYPERPARAMS"]
 
 rl_zoo3.ALGOS.update(ALGORITHMS)
 HYPERPARAMS_SAMPLER.update(reinforce=samplers.sample_reinforce, finite_difference=samplers.sample_finite_difference)
 HYPERPARAMS_CONVERTER.update(reinforce=samplers.convert_reinforce, finite_difference=samplers.convert_finite_difference)
-read_ours_too()
+extend_experiments()

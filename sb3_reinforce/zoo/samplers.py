@@ -18,7 +18,7 @@ def sample_reinforce(
 
     :param trial: The trial
     :param n_actions: Dimension of the actions, not used
-    :param n_envs: Environments, which the rollout and its minibatches are measured against
+    :param n_envs: Environments, not used
     :param additional_args: For replay buffers, not used
     :return: Arguments of REINFORCE
     """

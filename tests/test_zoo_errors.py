@@ -1,0 +1,169 @@
+"""What the Zoo's commands say of a wrong command, a wrong configuration and a missing package."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("matplotlib")
+
+import rl_zoo3
+from huggingface_hub.errors import HTTPError
+from rl_zoo3.exp_manager import ExperimentManager
+from zoo_commands import train, zoo
+
+# The Zoo and what it calls warn of their own affairs
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+
+def message_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What a command that cannot be run says last."""
+    with pytest.raises(SystemExit):
+        zoo(*arguments)
+    return capsys.readouterr().err.rpartition("error: ")[2]
+
+
+def raising(error: Exception) -> Callable[..., None]:
+    def function(*arguments: object, **kwargs: object) -> None:
+        raise error
+
+    return function
+
+
+@pytest.mark.parametrize(
+    ("conf", "sentence"),
+    [
+        ("[1, 2]", "must map environments to settings, got a list"),
+        ("", "must map environments to settings, got a NoneType"),
+        ("CartPole-v1: {", "cannot be read: "),
+        ("Acrobot-v1: {policy: MlpPolicy}", "must have an entry CartPole-v1 or default"),
+        ("CartPole-v1:", "The entry CartPole-v1 of"),
+        ("CartPole-v1: 5", "must hold settings, such as policy: 'MlpPolicy', got 5"),
+    ],
+)
+def test_a_configuration_without_settings_is_named(
+    conf: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wrong.yml").write_text(conf)
+    arguments = ["train", "--algo", "reinforce", "-conf", str(tmp_path / "wrong.yml"), "-f", str(tmp_path)]
+    assert sentence in message_of(capsys, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ("policy: MlpPolicy", "must hold n_timesteps"),
+        ("n_timesteps: 100", "must hold policy"),
+        ("policy: 5, n_timesteps: 100", "policy must be a name, or the path of a class, got 5"),
+        ("policy: Mlp, n_timesteps: 100", "Policy Mlp unknown"),
+        ("policy: MlpPolicy, n_timesteps: 1e6", "write !!float 1e6"),
+        ("policy: MlpPolicy, n_timesteps: 0", "n_timesteps must be finite and >= 1, got 0"),
+        ("policy: MlpPolicy, n_timesteps: 100, n_envs: 0", "n_envs must be at least 1, got 0"),
+        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: 1e-3", "write !!float 1e-3"),
+        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: cos_1e-3", "lin_NUMBER"),
+        ("policy: MlpPolicy, n_timesteps: 100, ent_coef: lin_x", "lin_NUMBER"),
+        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: null", "Invalid value for learning_rate: None"),
+        ("policy: MlpPolicy, n_timesteps: 100, n_step: 5", "did you mean n_steps"),
+        ("policy: MlpPolicy, n_timesteps: 100, seed: 5", "'seed' is not a setting"),
+        ("policy: MlpPolicy, n_timesteps: 100, gamma: 3", "gamma must be finite and >= 0 and <= 1, got 3"),
+        ("policy: MlpPolicy, n_timesteps: 100, gamma: x", "gamma must be a number, got 'x' of type str"),
+        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: 'dict('", "policy_kwargs must be Python, but of 'dict('"),
+        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: [1]", "policy_kwargs must be a dict"),
+        ("policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm", "normalize must be Python, but of 'nn.Norm'"),
+        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
+        ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
+    ],
+)
+def test_a_wrong_setting_is_named(
+    entry: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wrong.yml").write_text(f"CartPole-v1: {{{entry}}}")
+    name = "finite_difference" if "LinearPolicy" in entry else "reinforce"
+    arguments = ["train", "--algo", name, "-conf", str(tmp_path / "wrong.yml"), "-f", str(tmp_path)]
+    assert sentence in message_of(capsys, *arguments)
+
+
+def test_a_conf_file_that_is_missing_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "nowhere.yml cannot be read" in message_of(capsys, "train", "--algo", "reinforce", "-conf", "nowhere.yml")
+
+
+def test_a_temperature_that_was_asked_for_is_not_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", "--algo", "reinforce", "--env", "Pendulum-v1", "-f", str(tmp_path)]
+    sentence = "temperature=0.5 is for discrete actions"
+    assert sentence in message_of(capsys, *arguments, "-params", "temperature:0.5")
+
+
+@pytest.mark.parametrize("error", [ValueError("another"), TypeError("f() got an unexpected keyword argument 'x'")])
+def test_an_error_that_is_not_of_the_configuration_stays_one(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ExperimentManager, "create_envs", raising(error))
+    with pytest.raises(type(error)) as caught:
+        train("reinforce", "-f", str(tmp_path))
+    assert caught.value is error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["fly"], "there is no command 'fly', only train, enjoy"),
+        (["push_to_hub"], "push_to_hub is not offered"),
+        (["train", "--algo", "reinforc"], "invalid choice: 'reinforc'"),
+        (["train", "--env", "CartPol-v1"], "--env CartPol-v1 is not registered, but CartPole-v"),
+        (["train", "-params", "baseline:none"], "write a text as"),
+        (["train", "-params", "n_steps:1/0"], "'n_steps:1/0' the value must be Python, but it says ZeroDivisionError"),
+        (["train", "-params", "gamma:0.9", "n_steps=5"], "'n_steps=5' must be KEY:VALUE"),
+        (["train", "--trial-id", "1"], "--trial-id needs --storage and --study-name"),
+        (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
+        (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
+        (["enjoy", "--algo", "reinforce"], "no published models of reinforce"),
+        (["train", "--algo", "reinforce", "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
+        (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
+        (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
+    ],
+)
+def test_a_wrong_command_is_answered_with_a_sentence(
+    arguments: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert sentence in message_of(capsys, *arguments)
+
+
+@pytest.mark.parametrize(("study", "trial"), [("other", "0"), ("study", "7")])
+def test_a_trial_that_is_missing_is_named(
+    study: str, trial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    storage = ("--storage", "sqlite:///study.db", "--study-name")
+    train("reinforce", "-optimize", "--n-trials", "1", "--n-evaluations", "1", "-n", "100", *storage, "study")
+    message = message_of(capsys, "train", "--algo", "reinforce", *storage, study, "--trial-id", trial)
+    assert f"no trial {trial} of reinforce in a study '{study}'" in message
+
+
+@pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])
+def test_a_benchmark_without_network_is_told_of_no_hub(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", raising(error))
+    assert "does not answer (no network): pass --no-hub" in message_of(capsys, "benchmark", "--log-dir", str(tmp_path))
+
+
+def test_a_package_of_the_extra_that_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in [module for module in sys.modules if module.startswith("rl_zoo3.plots")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "seaborn", None)
+    message = message_of(capsys, "plot_train")
+    assert "seaborn" in message and "pip install 'sb3-reinforce[zoo]'" in message
+
+
+def test_a_missing_package_of_the_user_is_not_put_down_to_the_extra(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrapper = ("-params", "env_wrapper:'nope_pkg.Wrapper'")
+    message = message_of(capsys, "train", "--algo", "reinforce", "-f", str(tmp_path), *wrapper)
+    assert "No module named 'nope_pkg'" in message and "sb3-reinforce" not in message

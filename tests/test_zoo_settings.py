@@ -1,0 +1,177 @@
+"""Which settings an algorithm gets in the Zoo: published, of a model, of a trial; and what they are turned into."""
+
+import argparse
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("matplotlib")
+
+import optuna
+import rl_zoo3
+import torch as th
+import yaml
+from gymnasium.error import DependencyNotInstalled
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from zoo_commands import RUN, config_of, train, zoo
+
+import sb3_reinforce.zoo
+from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
+
+# The Zoo and what it calls warn of their own affairs
+pytestmark = pytest.mark.filterwarnings("ignore")
+TASKS = {
+    "CartPole-v1", "Acrobot-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1", "LunarLander-v3",
+    "LunarLanderContinuous-v3", "BipedalWalker-v3", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Swimmer-v5",
+    "Ant-v5", "InvertedPendulum-v5", "Reacher-v5",
+}  # fmt: skip
+SCHEDULED = {
+    "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
+    "finite_difference": {"learning_rate", "delta_std"},
+}
+# Settings that go with none of those published for CartPole-v1
+OTHER = {
+    "reinforce": {"baseline": "leave_one_out", "n_steps": None, "n_episodes": 8, "gae_lambda": 1.0},
+    "finite_difference": {"estimator": "forward", "n_delta": 3, "delta_std": 0.2},
+}
+
+
+def load(run: Path) -> Any:
+    return ALGORITHMS[run.parent.name].load(run / f"{run.name.rpartition('_')[0]}.zip", device="cpu")
+
+
+def conf(folder: Path, **entries: Any) -> tuple[str, ...]:
+    """Arguments that name a configuration with these entries, whose runs go to the same folder."""
+    (folder / "conf.yml").write_text(yaml.safe_dump(entries))
+    return "-conf", str(folder / "conf.yml"), "-f", str(folder), "--eval-freq", "-1"
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_default_trains_on_observations_that_cannot_be_normalized(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="FrozenLake-v1")
+    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
+    assert published.pop("normalize")
+    assert config_of(tmp_path / name / "FrozenLake-v1_1") == published
+    zoo("enjoy", "--algo", name, "--env", "FrozenLake-v1", "-f", str(tmp_path), "--no-render", "-n", "100")
+    assert "Mean reward: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("env", "left_out"), [("CartPole-v1", set()), ("Pendulum-v1", {"temperature"}), ("FrozenLake-v1", {"normalize"})]
+)
+def test_a_default_is_fitted_to_the_spaces(env: str, left_out: set[str], tmp_path: Path) -> None:
+    default = {"policy": "MlpPolicy", "n_timesteps": 32, "temperature": "lin_1", "normalize": True}
+    train("reinforce", *conf(tmp_path, default=default), env=env)
+    assert default.keys() - config_of(tmp_path / "reinforce" / f"{env}_1").keys() == left_out
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_argument_that_may_be_a_schedule_may_fall(name: str, tmp_path: Path) -> None:
+    entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1")
+    entry = {"policy": "MlpPolicy", "n_timesteps": 64, **({"n_delta": 2} if "delta_std" in entry else {}), **entry}
+    train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
+    model = load(tmp_path / name / RUN)
+    for key in SCHEDULED[name]:
+        assert [getattr(model, key)(left) for left in (1.0, 0.5, 0.0)] == [0.5, 0.25, 0.0]
+    # What is written down can be read again
+    assert config_of(tmp_path / name / RUN) == entry
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_model_goes_on_with_its_own_settings(name: str, tmp_path: Path) -> None:
+    params = [f"{key}:{value!r}" for key, value in OTHER[name].items()]
+    common = ("-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), "-params")
+    train(name, *common, *params, "policy:'MlpPolicy'", "policy_kwargs:dict(net_arch=[5])")
+    before = load(tmp_path / name / RUN)
+    # With a rate of 0 what is saved is what was loaded
+    train(name, "-i", str(tmp_path / name / RUN / "CartPole-v1.zip"), *common, "learning_rate:0.0")
+    after = load(tmp_path / name / "CartPole-v1_2")
+    for key, value in OTHER[name].items():
+        present = getattr(after, key)
+        assert (present(0.0) if callable(present) else present) == value
+    before, after = (th.nn.utils.parameters_to_vector(model.policy.parameters()) for model in (before, after))
+    assert th.equal(before, after)
+    assert config_of(tmp_path / name / "CartPole-v1_2") == config_of(tmp_path / name / RUN) | {"learning_rate": 0.0}
+
+
+def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path: Path) -> None:
+    arguments = conf(tmp_path, **{"CartPole-v1": {"policy": "MlpPolicy", "n_timesteps": 64, "gamma": 0.5}})
+    train("reinforce", "-n", "64", "--eval-freq", "-1", "-f", str(tmp_path))
+    train("reinforce", "-i", str(tmp_path / "reinforce" / RUN / "CartPole-v1.zip"), *arguments)
+    assert load(tmp_path / "reinforce" / "CartPole-v1_2").gamma == 0.5
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_the_settings_are_found_beside_an_installed_and_a_cloned_zoo(installed: bool) -> None:
+    # Where this folder is missing the Zoo looks one above
+    with mock.patch.object(Path, "is_dir", lambda path: installed):
+        manager = ExperimentManager(argparse.Namespace(), "reinforce", "CartPole-v1", "")
+    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())["CartPole-v1"]
+    assert manager.read_hyperparameters()[0] == published
+
+
+def test_a_reload_changes_nothing() -> None:
+    importlib.reload(sb3_reinforce.zoo.experiments)
+    importlib.reload(sb3_reinforce.zoo)
+    for name in ("read_hyperparameters", "_preprocess_hyperparams", "setup_experiment"):
+        method = getattr(ExperimentManager, name).__wrapped__
+        assert method is inspect.unwrap(method) and method.__globals__["__name__"] == "rl_zoo3.exp_manager"
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
+    train(name, "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--no-optim-plots", *study)
+    backend = optuna.storages.journal.JournalFileBackend("study.log")
+    trials = optuna.load_study(study_name="study", storage=optuna.storages.JournalStorage(backend)).trials
+    assert [trial.state.name for trial in trials] == ["COMPLETE", "COMPLETE"]
+    for number, trial in enumerate(trials):
+        train(name, *study, "--trial-id", str(number))
+        assert (
+            config_of(Path(f"logs/{name}/CartPole-v1_{number + 2}"))["learning_rate"] == trial.params["learning_rate"]
+        )
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name: str) -> None:
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
+    for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
+        fixed = {key: published[entry][key] for key in ("policy", "estimator", "n_top") if key in published[entry]}
+        for _ in range(20):
+            trial = study.ask()
+            sample = HYPERPARAMS_SAMPLER[name](trial, 1, 8, {})
+            assert HYPERPARAMS_CONVERTER[name](trial.params) == sample
+            ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
+
+
+def test_the_settings_cover_what_is_promised() -> None:
+    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
+    assert published.keys() >= TASKS | {"atari", "default"}
+
+
+@pytest.mark.parametrize(
+    ("name", "env"),
+    [
+        (name, env)
+        for name in ALGORITHMS
+        for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
+        if env not in ("atari", "default")
+    ],
+)
+def test_every_entry_trains(name: str, env: str, tmp_path: Path) -> None:
+    try:
+        rl_zoo3.utils.gym.make(env).close()
+    except DependencyNotInstalled as error:
+        pytest.skip(str(error))
+    train(name, "-n", "1", "--eval-freq", "-1", "-f", str(tmp_path), env=env)
+    assert (tmp_path / name / f"{env}_1" / f"{env}.zip").exists()

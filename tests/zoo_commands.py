@@ -1,0 +1,30 @@
+"""The Zoo's commands as functions, for its tests."""
+
+import sys
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import matplotlib
+import yaml
+
+from sb3_reinforce.zoo import ALGORITHMS
+from sb3_reinforce.zoo.__main__ import main
+
+NAMES = [*ALGORITHMS, "a2c"]
+RUN = "CartPole-v1_1"
+
+
+def zoo(*arguments: str) -> None:
+    """A command, as from a shell in the current folder."""
+    with mock.patch.object(sys, "argv", ["sb3-reinforce-zoo", *arguments]), matplotlib.rc_context({"backend": "agg"}):
+        main()
+
+
+def train(name: str, *arguments: str, env: str = "CartPole-v1") -> None:
+    zoo("train", "--algo", name, "--env", env, "--seed", "1", "--eval-episodes", "2", *arguments)
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    """The settings that the Zoo has written beside a model."""
+    return dict(yaml.unsafe_load((run / run.name.rpartition("_")[0] / "config.yml").read_text()))
