@@ -57,7 +57,7 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is array and obs.dtype is dtype and obs.ndim == 1 and obs.size == size:
+        if type(obs) is array and obs.dtype is dtype and obs.ndim == 1 and len(obs) == size:
             rows[i] = obs
         else:
             env._save_obs(i, obs)
