@@ -44,7 +44,7 @@ from sb3_reinforce.zoo import HYPERPARAMS
 ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "ars")
 SEARCHES = ("finite_difference", "ars")
 BUDGETS = {
-    "CartPole-v1": 100_000, "Acrobot-v1": 300_000, "MountainCarContinuous-v0": 100_000, "LunarLander-v3": 200_000,
+    "CartPole-v1": 100_000, "Acrobot-v1": 500_000, "MountainCarContinuous-v0": 100_000, "LunarLander-v3": 200_000,
 }  # fmt: skip
 OTHER_BUDGET = 1_000_000
 N_EVALUATIONS = 20
