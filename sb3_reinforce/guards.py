@@ -82,7 +82,7 @@ class Guard:
     """
 
     def __init__(self, venv: VecEnv, has_statistics: bool):
-        self.venv, self.has_statistics, self.step = venv, has_statistics, stepper(venv)
+        self.venv, self.has_statistics, self.stepper = venv, has_statistics, stepper(venv)
         self.actions = np.empty(0)
 
     def reset(self) -> VecEnvObs:
@@ -102,13 +102,22 @@ class Guard:
 
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step."""
-        obs, rewards, dones, infos = self.step(self.actions)
+        obs, rewards, dones, infos = self.stepper(self.actions)
         if self.has_statistics:
             check_finite("The reward", rewards, (None,))
             check_finite("The observation", obs, (None,))
             for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
                 check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
         return obs, rewards, dones, infos
+
+    def step(self, actions: np.ndarray) -> VecEnvStepReturn:
+        """
+        Make a step, for wrappers that make several at a time.
+
+        :param actions: Shape ``(n_envs, ...)``
+        """
+        self.step_async(actions)
+        return self.step_wait()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.venv, name)

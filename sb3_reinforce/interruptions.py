@@ -56,19 +56,21 @@ def interruptible() -> Iterator[None]:
     Within the block, SIGTERM raises a ``KeyboardInterrupt``, so that the model can still be saved; by default it would
     end the process at once. Where somebody handles it otherwise, that is left so.
     """
-    own: dict[int, Any] = {}
+    own: dict[int, tuple[Any, Any]] = {}
     for number in (signal.SIGINT, signal.SIGTERM) if in_main_thread() else ():
         handler = before = signal.getsignal(number)
         if number == signal.SIGTERM and before is signal.SIG_DFL:
             handler = signal.default_int_handler
         if callable(handler):
-            own[number] = before
-            signal.signal(number, partial(uninterrupted.handle, handler))
+            own[number] = before, partial(uninterrupted.handle, handler)
+            signal.signal(number, own[number][1])
     try:
         yield
     finally:
-        for changed, before in own.items():
-            signal.signal(changed, before)
+        for changed, (before, during) in own.items():
+            # A callback may have set another handler, for good
+            if signal.getsignal(changed) is during:
+                signal.signal(changed, before)
 
 
 def in_main_thread() -> bool:

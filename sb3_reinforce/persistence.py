@@ -63,7 +63,8 @@ class Persistent(BaseAlgorithm):
         :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
             device) into the state in which they were when the model was saved. Training then goes on as if it had not
             been interrupted, from a reset of the environments on; their inside, their generators and the statistics of
-            VecNormalize are not in the file
+            VecNormalize are not in the file. A model with a seed seeds them anew here: to seed them otherwise, do so
+            after loading
         :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones
         :return: The model
         :raises TypeError: If an argument is of the wrong kind, or the algorithm has none of this name

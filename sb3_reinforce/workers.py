@@ -1,9 +1,11 @@
 """Worker processes of a ``SubprocVecEnv``: a dead one is named, with its exception, instead of being waited for."""
 
+import os
 import shutil
 import signal
 import traceback
 import weakref
+from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from tempfile import mkdtemp
@@ -25,13 +27,17 @@ class Watched:
     :param remote: The plain end of the pipe
     :param process: The worker
     :param env: The number of its environment
-    :param space: The observation space
+    :param workers: The environments that it is one of
     :param note: A file in which the worker tells about its end
     """
 
-    def __init__(self, remote: Any, process: Any, env: int, space: Any, note: Path):
-        self.remote, self.process, self.env, self.space, self.note = remote, process, env, space, note
+    def __init__(self, remote: Any, process: Any, env: int, workers: SubprocVecEnv, note: Path):
+        self.remote, self.process, self.env, self.note = remote, process, env, note
+        # With a reference to its owner, the folder of the notes would wait for the garbage collector
+        self.workers: Any = weakref.proxy(workers)
         self.question = ""
+        # A worker may die in the middle of an answer that does not fit into the pipe
+        remote._recv = partial(remote._recv, read=self.read)
 
     def send(self, message: tuple[str, Any]) -> None:
         """
@@ -40,16 +46,18 @@ class Watched:
         :param message: The question and its data
         :raises ConnectionError: If the worker is dead and is asked for more than its end
         """
-        if self.question:
-            self.answer()
         is_last = message[0] == "close"
         try:
+            if self.question:
+                self.answer()
             with uninterrupted:
                 self.remote.send(message)
                 self.question = "" if is_last else message[0]
-        except ConnectionError as error:
-            if not is_last:
-                raise self.died() from error
+        except Exception as error:
+            # Whoever closes does not ask any more what a worker had to say
+            if is_last:
+                return
+            raise (self.died() if isinstance(error, ConnectionError) else error) from error
 
     def recv(self) -> Any:
         """
@@ -61,15 +69,31 @@ class Watched:
         question = self.question
         if not question:
             return None
-        answer = self.answer()
+        try:
+            answer = self.answer()
+            self.check(question, answer)
+        except BaseException:
+            # The others' answers are left to the next question, not to ``close``
+            self.workers.waiting = False
+            raise
+        return answer
+
+    def check(self, question: str, answer: Any) -> None:
+        """
+        Check what the environment returned.
+
+        :param question: What it was asked for
+        :param answer: What it answered
+        :raises BadData: If that is malformed
+        """
+        space = self.workers.observation_space
         if question in ("step", "reset"):
-            check_observation(self.space, answer[0], self.env)
+            check_observation(space, answer[0], self.env)
         if question == "step":
             _, reward, done, info, _ = answer
             as_reward(reward, self.env)
             if done:
-                check_observation(self.space, info["terminal_observation"], self.env)
-        return answer
+                check_observation(space, info["terminal_observation"], self.env)
 
     def answer(self) -> Any:
         """
@@ -78,25 +102,43 @@ class Watched:
         :raises ConnectionError: If it dies instead
         """
         try:
-            if self.remote not in wait([self.remote, self.process.sentinel]):
-                raise EOFError
+            self.wait()
             with uninterrupted:
-                answer = self.remote.recv()
+                # Even if it cannot be unpickled, it has been read
                 self.question = ""
-            return answer
+                return self.remote.recv()
         except (EOFError, ConnectionError) as error:
             self.question = ""
             raise self.died() from error
+
+    def wait(self) -> None:
+        """
+        Wait until there is something to read.
+
+        :raises EOFError: If the worker dies first
+        """
+        if self.remote not in wait([self.remote, self.process.sentinel]):
+            raise EOFError
+
+    def read(self, descriptor: int, size: int) -> bytes:
+        """
+        ``os.read`` of a part of an answer.
+
+        :param descriptor: The pipe
+        :param size: The most bytes to read
+        """
+        self.wait()
+        return os.read(descriptor, size)
 
     def died(self) -> ConnectionError:
         """The error that tells how the worker died."""
         # A pipe may close a moment before its process is gone
         self.process.join(timeout=5)
         code = self.process.exitcode
-        if self.note.exists():
-            end = f"raised {self.note.read_text(encoding='utf-8')}"
-        elif code is not None and code < 0:
+        if code is not None and code < 0:
             end = f"was killed by {signal.Signals(-code).name}"
+        elif self.note.exists():
+            end = f"raised {self.note.read_text(encoding='utf-8')}"
         else:
             end = f"ended with exit code {code}"
         return ConnectionError(f"The worker of environment {self.env} died: it {end}")
@@ -152,7 +194,7 @@ def watch(env: SubprocVecEnv) -> None:
     notes = mkdtemp(prefix="sb3_reinforce_")
     weakref.finalize(env, shutil.rmtree, notes, ignore_errors=True)
     workers.remotes = tuple(
-        Watched(remote, process, i, env.observation_space, Path(notes, str(i)))
+        Watched(remote, process, i, env, Path(notes, str(i)))
         for i, (remote, process) in enumerate(zip(workers.remotes, workers.processes, strict=True))
     )
     for remote in workers.remotes:

@@ -15,7 +15,14 @@ from gymnasium import spaces
 from models import KINDS, make
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 NAN, INF = float("nan"), float("inf")
 LENGTH = 7
@@ -352,6 +359,27 @@ def test_a_folder_for_the_workers_notes_is_removed_with_the_environment():
     del env
     gc.collect()
     assert not folder.exists()
+
+
+class Twice(VecEnvWrapper):
+    """Makes two steps with the same actions."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_async(self, actions):
+        self.again = actions
+
+    def step_wait(self):
+        self.venv.step(self.again)
+        return self.venv.step(self.again)
+
+
+def test_wrappers_that_make_several_steps_are_guarded_too():
+    env = VecNormalize(Twice(of_two(fault="reward", at=5, value=NAN)))
+    with pytest.raises(ValueError, match="reward of environment 1"):
+        make("steps", env).learn(400)
+    assert all(np.isfinite(part).all() for part in statistics(env))
 
 
 @pytest.mark.parametrize("kind", ["steps", "search"])

@@ -16,6 +16,14 @@ from sb3_reinforce import REINFORCE
 all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
+@pytest.fixture(autouse=True)
+def as_in_a_terminal():
+    """A shell that runs the tests in the background lets them ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class At(BaseCallback):
     """Does something at one step."""
 
@@ -87,15 +95,16 @@ def test_an_update_is_finished_before_a_signal_is_handled(number, kind):
         assert len(critic_steps) == 3 * model.n_critic_updates
 
 
-def test_each_signal_of_an_update_is_handled():
+@pytest.mark.parametrize("order", [(signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)])
+def test_each_signal_of_an_update_is_handled(order):
     seen = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: seen.append(number))
     model = make("steps", Corridor((7,)))
 
     def both_signals(*rest):
         if model._n_updates == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGTERM)
+            for number in order:
+                signal.raise_signal(number)
 
     model.policy.optimizer.register_step_pre_hook(both_signals)
     try:
@@ -114,6 +123,19 @@ def test_sigterm_is_left_to_a_user_who_handles_it():
     finally:
         signal.signal(signal.SIGTERM, before)
     assert len(seen) == 1 and model.num_timesteps == 64
+
+
+def test_a_handler_that_a_callback_sets_stays():
+    before = signal.getsignal(signal.SIGTERM)
+
+    def own(number, frame):
+        raise SystemExit
+
+    try:
+        make("steps", Corridor()).learn(64, At(3, lambda: signal.signal(signal.SIGTERM, own) or True))
+        assert signal.getsignal(signal.SIGTERM) is own
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_training_in_another_thread_sets_no_handlers():
