@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
@@ -54,7 +54,8 @@ def collect(
     :param model: The algorithm; its ``_last_obs`` and ``num_timesteps`` are kept up to date
     :param env: The environments
     :param callback: Called at each step, with the locals that the callbacks of Stable-Baselines3 read
-    :param rollout_buffer: The rollout buffer; it grows where it is too small and keeps one row per step
+    :param rollout_buffer: The rollout buffer; it grows where it is too small and keeps one row per step. Its
+        ``log_probs`` are computed where a callback can read them, and 0 otherwise: training does not need them
     :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
     :param with_critic: Whether V(s) will be needed
     :return: How the episodes ended; None if the callback stopped the collection
@@ -62,7 +63,7 @@ def collect(
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
-    as_env_actions, step = env_actions_of(policy), stepper(env)
+    as_env_actions, step, is_heard = env_actions_of(policy), stepper(env), hears(callback)
     all_dones: list[Bools] = []
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
@@ -90,9 +91,10 @@ def collect(
         model.num_timesteps += env.num_envs
         model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
 
-        callback.update_locals(locals())
-        if not callback.on_step():
-            return None
+        if is_heard:
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return None
         # After the callback, which may have changed the rewards in place; some VecEnvs reuse the array of the dones
         rollout_buffer.rewards[n_steps] = rewards
         all_dones.append(dones.astype(bool))
@@ -110,10 +112,19 @@ def collect(
         rollout_buffer.pos = n_steps = n_steps + 1
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
-    if log_probs is None:
+    if log_probs is None and is_heard:
         shape = rollout_buffer.rewards.shape
         rollout_buffer.log_probs = actor.log_prob(rollout_buffer.observations, rollout_buffer.actions).reshape(shape)
     return Ends(np.stack(all_dones), terminal_obs)
+
+
+def hears(callback: BaseCallback) -> bool:
+    """
+    Whether anybody is told of the steps: of no callback at all, Stable-Baselines3 makes one that does nothing.
+
+    :param callback: What ``learn`` was given, as a callback
+    """
+    return not (type(callback) is ConvertCallback and callback.callback is None)
 
 
 def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarray]:

@@ -47,12 +47,13 @@ def step_in_turn(env: DummyVecEnv, actions: np.ndarray) -> VecEnvStepReturn:
     # The usual observation is written without asking further; to compare two shapes takes as long as all else here
     is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
     array, dtype, size = (np.ndarray, rows.dtype, rows.shape[1]) if is_vector else (None, None, 0)
+    dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
-        dones[i] = is_done = terminated or truncated
-        if is_done:
+        if terminated or truncated:
+            dones[i] = True
             check_observation(env.observation_space, obs, i)
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)

@@ -199,8 +199,12 @@ def test_the_buffer_is_that_of_a2c():
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
-def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_fn, monkeypatch):
-    """The laid-out actor asks the policy nothing; the general one takes one pass more, for all log-probabilities."""
+@pytest.mark.parametrize("own_callback", [None, lambda *_: True])
+def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_fn, own_callback, monkeypatch):
+    """
+    The laid-out actor asks the policy nothing; the general one takes one pass more, for all log-probabilities, where a
+    callback can read them.
+    """
     policy_kwargs = {"activation_fn": activation_fn}
     model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, policy_kwargs=policy_kwargs)
     calls = {"get_distribution": 0, "predict_values": 0}
@@ -212,9 +216,11 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_
             return original(*args)
 
         monkeypatch.setattr(ActorCriticPolicy, name, counted)
-    _, callback = model._setup_learn(1)
+    _, callback = model._setup_learn(1, own_callback)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, None)
-    assert calls["get_distribution"] == (0 if activation_fn is th.nn.Tanh else model.rollout_buffer.size() + 1)
+    passes = model.rollout_buffer.size() + (own_callback is not None)
+    assert calls["get_distribution"] == (0 if activation_fn is th.nn.Tanh else passes)
+    assert model.rollout_buffer.log_probs.any() == (own_callback is not None)
     assert calls["predict_values"] <= (3 if baseline == "value" else 0)
 
 
