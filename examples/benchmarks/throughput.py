@@ -8,9 +8,9 @@ and their medians printed. With rollouts of 2048 steps REINFORCE and A2C make on
     python examples/benchmarks/throughput.py --env CartPole-v1 --n-envs 1 8 64
 
 Where the time of a vector step of 8 CartPole-v1 environments goes, in rollouts of 2048 steps (microseconds on one core
-of a shared machine; the shares are what counts): environments 50 (their VecEnv's own ``step`` takes 64), actor and
-sampling 10, bookkeeping, callback and storage 10, critic's values 2, returns and checks 2, policy step 14, critic's
-pass 9. Measured with a timer around each part; the passes of the networks are tanh, a third, and matrix products.
+of a shared machine; the shares are what counts): environments 45 (their VecEnv's own ``step`` takes 60), actor and
+sampling 7, bookkeeping and storage 5 (and 4 with a callback), critic's values 2, returns and checks 2, policy step 10,
+critic's pass 6. Measured with a timer around each part. Of what is learning, half is matrix products.
 """
 
 import argparse
