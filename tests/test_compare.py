@@ -2,8 +2,11 @@
 
 import importlib.util
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 from unittest import mock
@@ -119,6 +122,24 @@ def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(
     assert {path.name for path in tmp_path.glob("*.png")} == {"picture_curves.png", "picture_summary.png"}
     median = final[final["algorithm"] == "reinforce"]["return"].median()
     assert f"| CartPole-v1 (200) | REINFORCE | 2 | {median:.1f} (" in capsys.readouterr().out
+
+
+def test_sigterm_ends_the_processes_too(tmp_path: Path) -> None:
+    output = tmp_path / "results.csv"
+    arguments = ["--tasks", "CartPole-v1", "--algorithms", "reinforce", "--timesteps", "10000000", "--output", output]
+    script = subprocess.Popen([sys.executable, BENCHMARKS / "compare.py", *arguments], start_new_session=True)
+    while not output.exists():
+        time.sleep(0.1)
+    # Time for the pool to start
+    time.sleep(3)
+    script.terminate()
+    script.wait(60)
+    deadline = time.monotonic() + 30
+    with pytest.raises(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.killpg(script.pid, 0)
+            time.sleep(0.1)
+        os.killpg(script.pid, signal.SIGKILL)
 
 
 def test_a_task_that_is_not_registered_is_named_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

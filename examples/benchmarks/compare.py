@@ -167,6 +167,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.tasks) - gym.registry.keys():
         parser.error(f"--tasks: {', '.join(unknown)} not registered in Gymnasium")
+    # As Ctrl-C, which ends the pool's processes too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     if not arguments.output.exists():
         arguments.output.write_text(",".join(COLUMNS) + "\n")
