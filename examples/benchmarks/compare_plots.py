@@ -61,7 +61,7 @@ def iqm_of_points(scores: np.ndarray) -> np.ndarray:
 
 def draw_curves(results: pd.DataFrame, clock: str) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
-    _, rows = plt.subplots(len(tasks), 2, figsize=(9, 2.6 * len(tasks)), layout="constrained", squeeze=False)
+    figure, rows = plt.subplots(len(tasks), 2, figsize=(9, 2.6 * len(tasks)), layout="constrained", squeeze=False)
     for axes, ((task, budget), runs) in zip(rows, tasks, strict=True):
         for algorithm, mine in runs.groupby("algorithm", sort=False):
             seconds = mine[mine["evaluation"] == "final"][clock].median()
@@ -71,7 +71,9 @@ def draw_curves(results: pd.DataFrame, clock: str) -> None:
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
         axes[0].set(title=task, xlabel="steps", ylabel="return")
         axes[1].set(title=task, xlabel="seconds of training", xscale="symlog")
-    rows[0, 0].legend(frameon=False, fontsize="small")
+    # An algorithm need not have been run on the first task
+    lines = {line.get_label(): line for axis in rows[:, 0] for line in axis.get_lines()}
+    figure.legend(handles=list(lines.values()), loc="outside upper center", ncols=len(lines), frameon=False)
 
 
 def color(algorithm: str) -> str:
