@@ -82,6 +82,9 @@ class Persistent(BaseAlgorithm):
         if "_random_state" not in check_archive(path, ("data", "policy.pth")) and restore_random_state:
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         model = super().load(path, env, *args, **kwargs)
+        if kwargs.get("seed") is not None:
+            # A generator that was saved goes on from the seed before
+            model.set_random_seed(model.seed)
         if restore_random_state:
             python, numpy, torch, device = pickle.loads(model._random_state)
             random.setstate(python)
@@ -116,7 +119,8 @@ class Persistent(BaseAlgorithm):
             what this model does not have, such as an optimizer for the critic, is left out
         :param device: Device on which the parameters are loaded
         :raises TypeError: If a state is not a dict
-        :raises ValueError: If names do not match, a number is not finite, or a state is that of another optimizer
+        :raises ValueError: If names do not match, a number is not finite, or a state is that of another optimizer or
+            of other parameters
         :raises RuntimeError: If the parameters of the policy have other names or shapes
         """
         states = load_path_or_dict
@@ -139,7 +143,8 @@ class Persistent(BaseAlgorithm):
         try:
             super().set_parameters(own, exact_match, device)
             for name in own:
-                check_settings(name, recursive_getattr(self, name))
+                if isinstance(part := recursive_getattr(self, name), th.optim.Optimizer):
+                    check_optimizer(name, part, before[name]["state"])
         except BaseException:
             super().set_parameters(before, device=device)
             raise
@@ -176,18 +181,26 @@ def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
             yield from numbers(f"{name}.{key}", part)
 
 
-def check_settings(name: str, part: Any) -> None:
+def check_optimizer(name: str, optimizer: th.optim.Optimizer, before: Mapping[Any, Mapping[str, Any]]) -> None:
     """
-    Check that an optimizer has kept its settings, which the state of another one would have replaced.
+    Check that an optimizer has kept its settings, and that its moments are those of its parameters: a fused one would
+    write beyond moments of another shape.
 
     :param name: Its name
-    :param part: The optimizer; anything else passes
-    :raises ValueError: If one is missing
+    :param optimizer: The optimizer with its new state
+    :param before: The moments that it had
+    :raises ValueError: If a setting is missing or of another kind, or moments do not go with the parameters
     """
-    groups = part.param_groups if isinstance(part, th.optim.Optimizer) else []
-    missing = sorted({setting for group in groups for setting in part.defaults.keys() - group.keys()})
-    if missing:
-        raise ValueError(
-            f"load_path_or_dict[{name!r}] must be the state of a {type(part).__name__}, but it has no "
-            f"{', '.join(missing)}: it is that of another optimizer"
-        )
+    other = f"load_path_or_dict[{name!r}] must be the state of a {type(optimizer).__name__} for this policy, but"
+    for group in optimizer.param_groups:
+        for setting, default in optimizer.defaults.items():
+            if setting not in group:
+                raise ValueError(f"{other} it has no {setting}: it is that of another optimizer")
+            if isinstance(default, (float, tuple)) and type(group[setting]) not in (type(default), list, int):
+                raise ValueError(f"{other} its {setting} is {group[setting]!r}")
+    moments = {key for each in before.values() for key in each}
+    for parameter, state in optimizer.state.items():
+        shapes = {value.shape for value in state.values() if isinstance(value, th.Tensor) and value.dim()}
+        if not shapes <= {parameter.shape} or not state.keys() >= moments:
+            got = ", ".join(f"{key} of shape {tuple(np.shape(value))}" for key, value in state.items())
+            raise ValueError(f"{other} for a parameter of shape {tuple(parameter.shape)} it has {got or 'nothing'}")

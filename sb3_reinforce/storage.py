@@ -74,6 +74,8 @@ def replace(path: Path, content: bytes) -> None:
             with open(beside, "xb") as file:
                 write(file, content, path)
         os.replace(beside, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         beside.unlink(missing_ok=True)
 

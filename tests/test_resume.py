@@ -108,3 +108,22 @@ def test_generators_of_other_devices_are_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(th.cuda, "device_count", lambda: 2)
     make("steps").save(tmp_path / "model")
     KINDS["steps"][0].load(tmp_path / "model", device="cpu", restore_random_state=True)
+
+
+@pytest.mark.parametrize("kind", ["steps", "search"])
+def test_a_new_seed_at_load_draws_anew(kind, tmp_path):
+    kwargs = {"common_random_numbers": True} if kind == "search" else {}
+    make(kind, make_vec_env("CartPole-v1", 2), seed=0, **kwargs).learn(100).save(tmp_path / "model")
+    ends = []
+    for seed in (1, 2, 2):
+        model = KINDS[kind][0].load(tmp_path / "model", env=make_vec_env("CartPole-v1", 2), seed=seed, device="cpu")
+        ends.append(plain(model.learn(200).get_parameters()))
+    assert ends[1] == ends[2] != ends[0]
+
+
+def test_a_policy_acts_alike_before_a_save_and_after_a_load(tmp_path):
+    model = make("steps", temperature=lambda progress: 0.5 + progress, seed=0).learn(64)
+    model.save(tmp_path / "model")
+    obs = th.ones(1, 4)
+    models = (model, type(model).load(tmp_path / "model"))
+    assert th.equal(*(each.policy.get_distribution(obs).distribution.probs for each in models))

@@ -216,6 +216,12 @@ def last_key(state):
     return list(state)[-1]
 
 
+def with_moments(parameters, change):
+    optimizer = parameters["policy.optimizer"]
+    state = {i: change(moments) for i, moments in optimizer["state"].items()}
+    return {**parameters, "policy.optimizer": {**optimizer, "state": state}}
+
+
 WRONG = {
     "an unknown name": lambda p: {**p, "foo": {}},
     "a method's name": lambda p: {**p, "learn": {}},
@@ -250,6 +256,15 @@ WRONG = {
         "policy.optimizer": {
             "state": {},
             "param_groups": [{"params": p["policy.optimizer"]["param_groups"][0]["params"], "lr": 0.1, "alpha": 0.9}],
+        },
+    },
+    "moments of another shape": lambda p: with_moments(p, lambda moments: {**moments, "exp_avg": th.zeros(3, 77)}),
+    "moments missing": lambda p: with_moments(p, lambda moments: {"step": moments["step"]}),
+    "a setting of another kind": lambda p: {
+        **p,
+        "policy.optimizer": {
+            **p["policy.optimizer"],
+            "param_groups": [{**group, "betas": "x"} for group in p["policy.optimizer"]["param_groups"]],
         },
     },
 }
