@@ -1,14 +1,12 @@
 """Checks of what a user passes in: each error names the argument, its value and what is allowed."""
 
 import math
-import os
+import sys
 from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -35,7 +33,7 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     return number
 
 
-def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+def check_integer(name: str, value: Any, low: int, high: int = sys.maxsize) -> int:
     """
     Return ``value`` as an int if it is an integer in the range.
 
@@ -51,9 +49,22 @@ def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> in
         raise TypeError(f"{name} must be an integer, got {value!r} of type {type(value).__name__}")
     number = int(value)
     if not low <= number <= high:
-        at_most = f" and at most {high}" * (high < math.inf)
+        at_most = f" and at most {high}" * (high < sys.maxsize or number > high)
         raise ValueError(f"{name} must be at least {low}{at_most}, got {value!r}")
     return number
+
+
+def as_integers(model: Any, lows: Mapping[str, int]) -> None:
+    """
+    Check attributes of a model that are integers, and make Python's own integers of NumPy's, which not all take.
+
+    :param model: An algorithm with its arguments as attributes
+    :param lows: The smallest allowed value of each
+    :raises TypeError: If one is not an integer
+    :raises ValueError: If one is not in its range
+    """
+    for name, low in lows.items():
+        setattr(model, name, check_integer(name, getattr(model, name), low))
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -104,8 +115,6 @@ def check_function(name: str, value: Any, functions: dict[str, Callable[..., Any
 
 # A larger step can take a parameter out of the range of float32
 MAX_LEARNING_RATE = 1e6
-# What NumPy takes
-MAX_SEED = 2**32 - 1
 
 
 class CheckedSchedule(FloatSchedule):
@@ -137,40 +146,6 @@ class CheckedSchedule(FloatSchedule):
         return check_number(f"{self.name} (at progress {progress_remaining:g})", value, self.low, self.high, above)
 
 
-def check_basics(
-    policy: Any, policy_kwargs: Any, stats_window_size: Any, tensorboard_log: Any, verbose: Any, seed: Any, device: Any
-) -> None:
-    """
-    Check arguments that Stable-Baselines3 uses as soon as it has them. Called at construction and again by ``load``.
-
-    :param policy: The argument of this name, as are all others
-    :param policy_kwargs: None or a dict
-    :param stats_window_size: 1 or more
-    :param tensorboard_log: None or a path
-    :param verbose: 0 or more
-    :param seed: None, or from 0 to 2**32 - 1
-    :param device: A device, or "auto"
-    :raises TypeError: If one is of the wrong kind
-    :raises ValueError: If one is out of its range
-    """
-    if not isinstance(policy, (str, type)):
-        raise TypeError(f"policy must be a name or a class, got {policy!r} of type {type(policy).__name__}")
-    check_kind("policy_kwargs", policy_kwargs, (Mapping,))
-    check_kind("tensorboard_log", tensorboard_log, (str, os.PathLike))
-    check_integer("stats_window_size", stats_window_size, 1)
-    check_integer("verbose", verbose, 0)
-    if seed is not None:
-        check_integer("seed", seed, 0, MAX_SEED)
-    check_kind("device", device, (str, th.device), optional=False)
-    if device != "auto":
-        try:
-            th.device(device)
-        except RuntimeError as error:
-            raise ValueError(
-                f"device must be 'auto' or a device that PyTorch knows, got {device!r}: {error}"
-            ) from error
-
-
 def check_kind(name: str, value: Any, kinds: tuple[type, ...], optional: bool = True) -> None:
     """
     Check the type of an argument.
@@ -184,39 +159,3 @@ def check_kind(name: str, value: Any, kinds: tuple[type, ...], optional: bool = 
     if not (isinstance(value, kinds) or (optional and value is None)):
         allowed = [*(kind.__name__ for kind in kinds), *["None"] * optional]
         raise TypeError(f"{name} must be {' or '.join(allowed)}, got {value!r} of type {type(value).__name__}")
-
-
-def check_learn(
-    env: Any,
-    total_timesteps: Any,
-    callback: Any,
-    log_interval: Any,
-    tb_log_name: Any,
-    reset_num_timesteps: Any,
-    progress_bar: Any,
-) -> None:
-    """
-    Check the arguments of ``learn``.
-
-    :param env: The model's environments
-    :param total_timesteps: The argument of this name, as are all others
-    :param callback: None, a callback, a function or a list of callbacks
-    :param log_interval: 1 or more, or None
-    :param tb_log_name: A name
-    :param reset_num_timesteps: True or False
-    :param progress_bar: True or False
-    :raises TypeError: If one is of the wrong kind
-    :raises ValueError: If one is out of its range, or the model has no environment
-    """
-    if env is None:
-        raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
-    check_number("total_timesteps", total_timesteps, 0)
-    if log_interval is not None:
-        check_integer("log_interval", log_interval, 1)
-    check_kind("tb_log_name", tb_log_name, (str,), optional=False)
-    check_flag("reset_num_timesteps", reset_num_timesteps)
-    check_flag("progress_bar", progress_bar)
-    for each in callback if isinstance(callback, list) else [callback]:
-        is_one = isinstance(each, BaseCallback) or (callable(each) and not isinstance(each, type) and each is callback)
-        if not (is_one or callback is None):
-            raise TypeError(f"callback must be a callback, a list of callbacks, a function or None, got {each!r}")

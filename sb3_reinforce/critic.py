@@ -102,18 +102,20 @@ def fit_critic(
     :param batch_size: Size of a minibatch; the last one of a pass may be smaller
     :param max_grad_norm: Bound on the norm of a step's gradient, None for no bound
     :return: The mean of the minibatches' losses; 0 for a critic without parameters of its own
-    :raises ValueError: If a gradient is not finite; the critic keeps the parameters of the step before
+    :raises ValueError: If a gradient is not finite; the critic keeps the parameters of the step before. If a parameter
+        is not finite afterwards; the critic keeps those before all passes
     """
     if not parameters:
         return 0.0
     losses = []
     inputs, predict_values = what_learns(policy, parameters, obs)
-    for _ in range(n_updates):
-        for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]
-            loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])
-            gradients = th.autograd.grad(loss, parameters)
-            optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
-            losses.append(loss.detach())
+    with optimization.kept_finite(parameters, "critic"):
+        for _ in range(n_updates):
+            for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]
+                loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])
+                gradients = th.autograd.grad(loss, parameters)
+                optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
+                losses.append(loss.detach())
     return float(th.stack(losses).mean())
 
 

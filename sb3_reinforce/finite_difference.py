@@ -20,9 +20,10 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce import optimization, parameters
-from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_basics, check_function, check_learn
+from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_function
 from sb3_reinforce.candidate_actors import LoopActor, make_actor
 from sb3_reinforce.candidates import Step, evaluate
+from sb3_reinforce.common_settings import check_basics, check_learn
 from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
 from sb3_reinforce.guards import guarded
@@ -352,9 +353,10 @@ class FiniteDifference(Persistent):
             gradient = gradient * self._delta_std / utility_std
         # The optimizer descends: here, and only here, the sign turns
         loss_gradient = [part[0] for part in parameters.split(-gradient[None], self._actor_parameters)]
-        grad_norm = optimization.step(
-            self.policy.optimizer, self._actor_parameters, loss_gradient, self.max_grad_norm, "utility"
-        )
+        with optimization.kept_finite(self._actor_parameters, "policy"):
+            grad_norm = optimization.step(
+                self.policy.optimizer, self._actor_parameters, loss_gradient, self.max_grad_norm, "utility"
+            )
         self._n_updates += 1
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

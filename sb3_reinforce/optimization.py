@@ -1,7 +1,11 @@
-"""One optimizer step from given gradients, refused before anything is changed if a gradient is not finite."""
+"""
+One optimizer step from given gradients, refused before anything is changed if a gradient is not finite, and taken back
+if the parameters would not be.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch as th
 
@@ -39,6 +43,31 @@ def step(
         parameter.grad = gradient if gradient is None or scale == 1 else gradient * scale
     optimizer.step()
     return norm
+
+
+@contextmanager
+def kept_finite(parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
+    """
+    Parameters that are changed within the block become what they were before it, if one of them is not finite after it.
+
+    A finite gradient can do that: Adam without its ``eps`` divides 0 by 0, and weight decay may be too large.
+
+    :param parameters: The parameters
+    :param name: What they belong to, for the message
+    :raises ValueError: If one of them is not finite
+    """
+    before = [parameter.detach().clone() for parameter in parameters]
+    try:
+        yield
+    finally:
+        if not th.cat([parameter.detach().flatten() for parameter in parameters]).isfinite().all():
+            with th.no_grad():
+                for parameter, old in zip(parameters, before, strict=True):
+                    parameter.copy_(old)
+            raise ValueError(
+                f"A step made a parameter of the {name} that is not finite. The parameters are those before it; a "
+                "lower learning_rate, other optimizer_kwargs or scaled rewards (VecNormalize) may help"
+            )
 
 
 def fuse(optimizer: th.optim.Optimizer) -> None:

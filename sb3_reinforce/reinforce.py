@@ -23,19 +23,19 @@ from sb3_reinforce import optimization
 from sb3_reinforce.arguments import (
     MAX_LEARNING_RATE,
     CheckedSchedule,
-    check_basics,
     check_flag,
     check_function,
-    check_learn,
 )
 from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.collection import check_data, collect, warn_of_own_methods
+from sb3_reinforce.common_settings import check_basics, check_learn
 from sb3_reinforce.critic import fit_critic
 from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.guards import guarded
 from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.persistence import Persistent
 from sb3_reinforce.policies import (
+    MAX_TEMPERATURE,
     Parameters,
     evaluate,
     floor_std,
@@ -261,7 +261,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         return groups
 
     def _apply_temperature_and_floor(self) -> None:
-        set_temperature(self.policy, self._scheduled("temperature", above=True))
+        set_temperature(self.policy, self._scheduled("temperature", above=True, high=MAX_TEMPERATURE))
         floor_std(self.policy, self.min_std)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
@@ -345,8 +345,10 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         if values is not None:
             loss = loss + self.vf_coef * F.mse_loss(values, steps.returns)
         gradient = th.autograd.grad(loss, actor, allow_unused=True)
-        grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
-        floor_std(self.policy, self.min_std)
+        with optimization.kept_finite(actor, "policy"):
+            grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
+        # The temperature is that of the progress made, with which a saved model will be loaded
+        self._apply_temperature_and_floor()
         self._n_updates += 1
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

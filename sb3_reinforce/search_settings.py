@@ -5,7 +5,8 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.arguments import check_basics, check_flag, check_function, check_integer, check_number
+from sb3_reinforce.arguments import as_integers, check_flag, check_function, check_number
+from sb3_reinforce.common_settings import check_basics_of
 from sb3_reinforce.estimators import ESTIMATORS
 from sb3_reinforce.perturbations import PERTURBATIONS
 
@@ -23,24 +24,24 @@ def check_finite_difference(model: Any) -> None:
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range, or does not go with another
     """
-    window, log = model._stats_window_size, model.tensorboard_log
-    check_basics(model.policy_class, model.policy_kwargs, window, log, model.verbose, model.seed, model.device)
+    check_basics_of(model)
     for name in ("common_random_numbers", "standardize_utilities", "deterministic"):
         check_flag(name, getattr(model, name))
     check_function("estimator", model.estimator, ESTIMATORS)
     check_function("perturbation", model.perturbation, PERTURBATIONS)
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, ActorCriticPolicy)):
         raise TypeError(f"policy must be a name or a subclass of ActorCriticPolicy, got {model.policy_class!r}")
+    least = {"n_eval_episodes": 1, "max_episode_steps": 1}
     if model.n_delta is not None:
-        check_integer("n_delta", model.n_delta, 2 if model.estimator == "regression" else 1)
+        least["n_delta"] = 2 if model.estimator == "regression" else 1
     if model.n_top is not None:
-        check_integer("n_top", model.n_top, 1)
+        least["n_top"] = 1
+    as_integers(model, least)
+    if model.n_top is not None:
         if model.estimator != "central":
             raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
         if model.n_delta is None or model.n_top > model.n_delta:
             raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
-    check_integer("n_eval_episodes", model.n_eval_episodes, 1)
-    check_integer("max_episode_steps", model.max_episode_steps, 1)
     if model.max_grad_norm is not None:
         check_number("max_grad_norm", model.max_grad_norm, 0, above=True)
 

@@ -7,15 +7,15 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_reinforce.arguments import (
-    check_basics,
+    as_integers,
     check_choice,
     check_flag,
     check_function,
-    check_integer,
     check_kind,
     check_number,
 )
 from sb3_reinforce.baselines import BASELINES
+from sb3_reinforce.common_settings import check_basics_of
 
 DEFAULT_N_STEPS = 32
 DEFAULT_N_EPISODES = 16
@@ -31,8 +31,7 @@ def check_reinforce(model: Any) -> None:
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range, or does not go with another
     """
-    window, log = model._stats_window_size, model.tensorboard_log
-    check_basics(model.policy_class, model.policy_kwargs, window, log, model.verbose, model.seed, model.device)
+    check_basics_of(model)
     check_function("baseline", model.baseline, BASELINES)
     if model.n_steps is None and model.n_episodes is None:
         model.n_steps = DEFAULT_N_STEPS if model.has_critic else None
@@ -42,12 +41,12 @@ def check_reinforce(model: Any) -> None:
             f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r} are both given: a rollout is either a "
             "number of steps or a number of whole episodes, so set one of them to None"
         )
+    least = {"n_critic_updates": 1, "batch_size": 1, "max_episode_steps": 1, "sde_sample_freq": -1}
     if model.n_steps is None:
-        check_integer("n_episodes", model.n_episodes, 2 if model.baseline in ("leave_one_out", "optimal") else 1)
+        least["n_episodes"] = 2 if model.baseline in ("leave_one_out", "optimal") else 1
     else:
-        check_integer("n_steps", model.n_steps, 1)
-    for name, low in {"n_critic_updates": 1, "batch_size": 1, "max_episode_steps": 1, "sde_sample_freq": -1}.items():
-        check_integer(name, getattr(model, name), low)
+        least["n_steps"] = 1
+    as_integers(model, least)
     for name in ("reward_to_go", "discount_scores", "normalize_advantage", "use_sde"):
         check_flag(name, getattr(model, name))
     check_kind("rollout_buffer_kwargs", model.rollout_buffer_kwargs, (Mapping,))

@@ -175,3 +175,42 @@ def test_an_observation_space_that_no_policy_can_see(kind, policy, space):
 def test_an_action_space_without_actions(kind):
     with pytest.raises(ValueError, match="action space"):
         make(kind, Corridor(action_space=spaces.Box(-1, 1, (0,))))
+
+
+@both
+def test_integers_of_numpy_and_ones_that_are_too_large(kind, tmp_path):
+    integers = {"seed": 3, "stats_window_size": 5, "max_episode_steps": 600}
+    integers |= {"batch_size": 16, "n_steps": 8, "n_critic_updates": 2} if kind == "steps" else {"n_delta": 2}
+    model = make(kind, **{name: np.int64(value) for name, value in integers.items()}).learn(16)
+    assert model.ep_info_buffer.maxlen == 5
+    model.save(tmp_path / "model")
+    given = {name: np.int64(value) for name, value in integers.items() if name != "stats_window_size"}
+    type(model).load(tmp_path / "model", env=gym.make("CartPole-v1"), **given).learn(16)
+    for name in integers.keys() - {"seed", "stats_window_size"}:
+        with pytest.raises(ValueError, match=rf"{name} must be at least .* and at most \d+, got {2**63}"):
+            make(kind, **{name: 2**63})
+
+
+def test_a_temperature_beyond_float32():
+    with pytest.raises(ValueError, match="temperature"):
+        make("steps", temperature=1e300)
+
+
+@both
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-1, 1, ()), spaces.MultiDiscrete([[2, 3], [4, 5]]), spaces.Dict({"x": spaces.Box(-1, 1, ())})]
+)
+def test_observations_of_a_number_of_dimensions_that_no_policy_can_see(space, kind):
+    env = Corridor()
+    env.observation_space = space
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    with pytest.raises(ValueError, match=r"observation space.* must have (a|one) dimension"):
+        make(kind, env, policy)
+
+
+@both
+def test_actions_of_two_dimensions(kind):
+    env = Corridor()
+    env.action_space = spaces.MultiDiscrete([[2, 3], [4, 5]])
+    with pytest.raises(ValueError, match="MultiDiscrete action space must have one dimension"):
+        make(kind, env)

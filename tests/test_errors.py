@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from environments import Corridor
 from gymnasium import spaces
+from models import make, plain
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -327,3 +328,40 @@ def test_a_worker_that_dies_is_named_at_once(start_method, tmp_path):
     model.save(tmp_path / "model")
     env.processes[1].kill()
     env.closed = True
+
+
+# Finite gradients that lead to parameters that are not
+EXPLODING = {
+    # The observation of a step that is never reached is 0, and so is its gradient: 0 / 0
+    "steps": {"policy_kwargs": {"net_arch": [4], "optimizer_kwargs": {"eps": 0.0}}},
+    "search": {
+        "learning_rate": 1.0,
+        "policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"weight_decay": 1e12}},
+    },
+}
+
+
+@pytest.mark.parametrize("kind", EXPLODING)
+def test_a_step_to_parameters_that_are_not_finite_is_taken_back(kind, tmp_path):
+    model = make(kind, Corridor((20,)) if kind == "search" else Unreached(), **EXPLODING[kind])
+    with pytest.raises(ValueError, match=r"made a parameter of the policy that is not finite.*optimizer_kwargs"):
+        model.learn(4000)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    model.save(tmp_path / "model")
+    type(model).load(tmp_path / "model")
+
+
+def test_a_critic_whose_passes_end_in_parameters_that_are_not_finite_keeps_those_before():
+    kwargs = {"net_arch": [4], "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"weight_decay": 1e38}}
+    model = make("steps", learning_rate=0.0, critic_learning_rate=1e3, policy_kwargs=kwargs)
+    before = plain(model.policy.state_dict())
+    with pytest.raises(ValueError, match="made a parameter of the critic that is not finite"):
+        model.learn(8)
+    assert plain(model.policy.state_dict()) == before
+
+
+class Unreached(Corridor):
+    """Its last observation's number is always 0."""
+
+    def observe(self):
+        return super().observe() * (np.arange(len(super().observe())) < 2)
