@@ -15,6 +15,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_reinforce.batches import check_batch, copy, info_of, one_of
+from sb3_reinforce.environment_checks import check_observation
 from sb3_reinforce.returns import Bools
 
 Restart: TypeAlias = Callable[[Any, Bools], Any]
@@ -26,9 +28,9 @@ def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: Bools) -> Any:
 
     :param env: An environment that does not reset itself
     :param ended: Which copies to reset, shape ``(n_envs,)``
-    :return: The observations of all copies
+    :return: The observations and infos of all copies
     """
-    return env.reset(options={"reset_mask": ended})[0]
+    return env.reset(options={"reset_mask": ended})
 
 
 def restart_cart_pole(env: Any, ended: Bools) -> Any:
@@ -37,12 +39,12 @@ def restart_cart_pole(env: Any, ended: Bools) -> Any:
 
     :param env: The environment
     :param ended: Which copies to reset, shape ``(n_envs,)``
-    :return: The observations of all copies
+    :return: The observations of all copies, and their infos, which are empty
     """
     env.state[:, ended] = env.np_random.uniform(env.low, env.high, (4, ended.sum()))
     env.steps[ended] = 0
     env.prev_done[ended] = False
-    return env.state.T.astype(np.float32)
+    return env.state.T.astype(np.float32), {}
 
 
 def restart_of(env: VectorEnv[Any, Any, Any]) -> Restart | None:
@@ -54,7 +56,8 @@ def restart_of(env: VectorEnv[Any, Any, Any]) -> Restart | None:
     :raises ValueError: If it resets them in place of the next step. An action would then be ignored and its transition
         would lead from one episode into the next
     """
-    mode = env.metadata.get("autoreset_mode")
+    # Environments of one class share their metadata
+    mode = getattr(env.unwrapped, "autoreset_mode", env.metadata.get("autoreset_mode"))
     if mode is AutoresetMode.SAME_STEP:
         return None
     if mode is AutoresetMode.DISABLED:
@@ -113,6 +116,7 @@ class GymnasiumVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step."""
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
+        check_batch(self.observation_space, obs, rewards, self.num_envs)
         dones = terminated | truncated
         if self.restart is None and dones.any() and "final_obs" not in env_infos:
             raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
@@ -123,12 +127,20 @@ class GymnasiumVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if env_infos or last_infos:
             infos = [info_of(last_infos if done else env_infos, i) for i, done in enumerate(dones)]
+            # Gymnasium's RecordEpisodeStatistics tells of an episode that has ended beside the infos of the next one
+            episodes = {key: values for key, values in env_infos.items() if key in ("episode", "_episode")}
+            for i in np.flatnonzero(dones).tolist():
+                infos[i] |= info_of(episodes, i)
         for info, is_cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
             info["TimeLimit.truncated"] = is_cut
         if dones.any():
-            for i in np.flatnonzero(dones).tolist():
+            ended = np.flatnonzero(dones).tolist()
+            for i in ended:
+                check_observation(self.observation_space, one_of(last_obs, i), i)
                 infos[i]["terminal_observation"] = copy(one_of(last_obs, i))
-            obs = obs if self.restart is None else self.restart(self.env, dones)
+            obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
+            for i in ended:
+                self.reset_infos[i] = info_of(reset_infos, i)
         return copy(obs), rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
@@ -177,12 +189,14 @@ class GymnasiumVecEnv(VecEnv):
         :param method_args: Its arguments
         :param indices: Of which copies
         :param kwargs: Its keyword arguments
-        :raises NotImplementedError: If the vector environment has no single copies that could be called
+        :raises NotImplementedError: If the vector environment has no copies that could be called, or only all at once
         """
-        copies = getattr(self.env.unwrapped, "envs", None)
+        copies, wanted = getattr(self.env.unwrapped, "envs", None), list(self._get_indices(indices))
+        if copies is None and len(wanted) == self.num_envs and hasattr(self.env.unwrapped, "call"):
+            return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
         if copies is None:
             raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
-        calls = [copies[i].get_wrapper_attr(method_name) for i in self._get_indices(indices)]
+        calls = [copies[i].get_wrapper_attr(method_name) for i in wanted]
         return [call(*method_args, **kwargs) for call in calls]
 
     def env_is_wrapped(
@@ -201,37 +215,3 @@ class GymnasiumVecEnv(VecEnv):
         """A picture of each copy."""
         pictures: Any = self.env.render() or [None] * self.num_envs
         return list(pictures)
-
-
-def one_of(obs: Any, i: int) -> Any:
-    """
-    The observation of one copy.
-
-    :param obs: Observations of all copies, an array or a dict of arrays
-    :param i: Which copy
-    """
-    return {key: part[i] for key, part in obs.items()} if isinstance(obs, dict) else obs[i]
-
-
-def copy(obs: Any) -> Any:
-    """
-    Observations that the environment does not write into later.
-
-    :param obs: An array or a dict of arrays
-    """
-    return {key: np.array(part) for key, part in obs.items()} if isinstance(obs, dict) else np.array(obs)
-
-
-def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """
-    The info of one copy from Gymnasium's dict of arrays, in which ``_key`` masks ``key``.
-
-    :param env_infos: The infos of a vector environment
-    :param i: Which copy
-    """
-    info = {}
-    for key, values in env_infos.items():
-        is_mask = key.startswith("_") and key[1:] in env_infos
-        if not is_mask and (f"_{key}" not in env_infos or env_infos[f"_{key}"][i]):
-            info[key] = info_of(values, i) if isinstance(values, dict) else values[i]
-    return info

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from environments import Corridor
 from gymnasium import spaces
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -233,3 +234,84 @@ def test_pictures():
     env.reset()
     assert len(env.get_images()) == 2 and env.get_images()[0].ndim == 3 and env.render().ndim == 3
     env.close()
+
+
+class Malformed(SyncVectorEnv):
+    """At its tenth step, something of another form."""
+
+    change = staticmethod(lambda obs, rewards: (obs, rewards))
+
+    def reset(self, **kwargs):
+        self.n_steps = 0
+        return super().reset(**kwargs)
+
+    def step(self, actions):
+        obs, rewards, *rest = super().step(actions)
+        self.n_steps += 1
+        return *(self.change(obs, rewards) if self.n_steps == 10 else (obs, rewards)), *rest
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda obs, rewards: (obs[:, :3], rewards), r"observation of environment 0 must have shape \(4,\)"),
+        (lambda obs, rewards: (obs.reshape(4, 3), rewards), "observations must be those of 3 environments"),
+        (lambda obs, rewards: (obs[:1], rewards), "observations must be those of 3 environments"),
+        (lambda obs, rewards: (obs + 1j, rewards), "dtype"),
+        (lambda obs, rewards: (obs, rewards[:, None]), "rewards must be 3 numbers"),
+        (lambda obs, rewards: (obs, rewards[:1]), "rewards must be 3 numbers"),
+        (lambda obs, rewards: (obs, rewards + 1j), "rewards must be 3 numbers"),
+    ],
+)
+def test_malformed_steps_are_named(change, message, wrapper, monkeypatch):
+    monkeypatch.setattr(Malformed, "change", staticmethod(change))
+    env = Malformed([lambda: gym.make("CartPole-v1")] * N_ENVS, autoreset_mode="SameStep")
+    model = REINFORCE("MlpPolicy", wrapper(GymnasiumVecEnv(env)), n_steps=16, device="cpu")
+    with pytest.raises(ValueError, match=f"{message}.*step 9 since"):
+        model.learn(100)
+    monkeypatch.undo()
+    assert model.learn(100).num_timesteps >= 100
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_episodes_that_gymnasium_records(mode):
+    vector_env = SyncVectorEnv([lambda: Corridor((4,))] * N_ENVS, autoreset_mode=mode)
+    model = REINFORCE("MlpPolicy", GymnasiumVecEnv(RecordEpisodeStatistics(vector_env)), n_steps=8, device="cpu")
+    model.learn(8 * N_ENVS)
+    assert [info["l"] for info in model.ep_info_buffer] == [4] * (2 * N_ENVS)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_the_infos_of_a_reset_are_those_of_the_last_one(mode):
+    """Reset tells how often it was called."""
+
+    class Counting(Corridor):
+        n_resets = 0
+
+        def reset(self, *, seed=None, options=None):
+            self.n_resets += 1
+            return super().reset(seed=seed)[0], {"n": self.n_resets}
+
+    env = synced(lambda: Counting((4,)), mode)
+    env.reset()
+    assert [info["n"] for info in env.reset_infos] == [1] * N_ENVS
+    for _ in range(4):
+        env.step(np.zeros(N_ENVS, int))
+    assert [info["n"] for info in env.reset_infos] == [2] * N_ENVS
+
+
+def test_methods_of_copies_in_other_processes():
+    env = GymnasiumVecEnv(AsyncVectorEnv([lambda: Corridor((4,))] * 2, autoreset_mode="SameStep"))
+    assert [repr(unwrapped) for unwrapped in env.env_method("has_wrapper_attr", "lengths")] == ["True"] * 2
+    with pytest.raises(NotImplementedError):
+        env.env_method("has_wrapper_attr", "lengths", indices=[0])
+    env.close()
+
+
+def test_environments_of_one_class_with_different_modes():
+    """Gymnasium has had the mode of the last one in what they share."""
+    env = SyncVectorEnv([Corridor] * 2, autoreset_mode="SameStep")
+    shared, env.metadata["autoreset_mode"] = env.metadata["autoreset_mode"], AutoresetMode.NEXT_STEP
+    GymnasiumVecEnv(env)
+    env.metadata["autoreset_mode"] = shared
