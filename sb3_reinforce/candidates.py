@@ -19,7 +19,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_reinforce.candidate_actors import MatrixActor
-from sb3_reinforce.environment_checks import all_finite
+from sb3_reinforce.environment_checks import all_finite, is_finite, told
 from sb3_reinforce.stepping import stepper
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
@@ -104,9 +104,9 @@ class Slots:
         """
         if all_finite(values):
             return
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(1) & self.active
+        bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
         for i in np.flatnonzero(bad).tolist():
-            raise ValueError(f"{name} of {self.describe(i)} is not finite: {values[i]}. {UNCHANGED}")
+            raise ValueError(f"{name} of {self.describe(i)} is not finite: {told(values[i])}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """

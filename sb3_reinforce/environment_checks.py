@@ -1,6 +1,5 @@
 """Checks of environments and of what they return. Each error names the environment; ``learn`` adds the step."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -56,6 +55,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
     if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
         raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
+    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) != 1:
+        raise ValueError(f"A MultiDiscrete action space must have one dimension, got {action_space}: flatten it")
     if 0 in (action_space.shape or ()):
         raise ValueError(f"The action space must not be empty, got {action_space}")
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
@@ -68,10 +69,34 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
                 f"got {space}"
             )
+        if isinstance(space, spaces.Box) and not space.shape:
+            raise ValueError(f"The observation space{where} must have a dimension, got {space}: make its shape (1,)")
+        if isinstance(space, spaces.MultiDiscrete) and len(space.shape) != 1:
+            raise ValueError(f"The observation space{where} must have one dimension, got {space}: flatten it")
         if 0 in (space.shape or ()):
             raise ValueError(f"The observation space{where} must not be empty, got {space}")
         if np.any(getattr(space, "start", 0)):
             raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
+
+
+def is_finite(values: np.ndarray) -> np.ndarray:
+    """
+    Which numbers are finite, also in float32, in which they are learned from.
+
+    :param values: Any shape
+    :return: The same shape
+    """
+    with np.errstate(over="ignore"):
+        return np.isfinite(values.astype(np.float32))
+
+
+def told(value: Any) -> str:
+    """
+    A number that is not finite, for a message.
+
+    :param value: It, or an array with it
+    """
+    return f"{value}{' (float32 ends at 3.4e38)' * bool(np.isfinite(value).all())}"
 
 
 def all_finite(values: np.ndarray) -> bool:
@@ -80,8 +105,8 @@ def all_finite(values: np.ndarray) -> bool:
 
     :param values: Any shape
     """
-    # One product costs less than isfinite and all; where it overflows, they decide
-    return values.dtype.kind != "f" or math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+    # One product costs less than isfinite and all; where it is large, they decide
+    return values.dtype.kind != "f" or float(np.vdot(values, values)) < 1e76 or bool(is_finite(values).all())
 
 
 def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
@@ -101,12 +126,12 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
     values = np.asarray(values)
     if all_finite(values):
         return
-    first = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
+    first = tuple(int(i) for i in np.argwhere(~is_finite(values))[0])
     step, env = (*where, *first)[:2]
     if step is None:
-        raise BadData(f"{name} of environment {env} is not finite: {values[first]}")
+        raise BadData(f"{name} of environment {env} is not finite: {told(values[first])}")
     raise ValueError(
-        f"{name} of environment {env} at step {step} of the rollout is not finite: {values[first]}. "
+        f"{name} of environment {env} at step {step} of the rollout is not finite: {told(values[first])}. "
         "The policy has not been updated with this rollout."
     )
 

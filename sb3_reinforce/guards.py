@@ -63,6 +63,15 @@ def watched(env: VecEnv | None) -> Iterator[None]:
         while isinstance(env, VecEnvWrapper):
             wrappers.append(env)
             env = env.venv
+        for wrapper in wrappers:
+            # What another wrapper has made of finite numbers may not be finite
+            if isinstance(wrapper, VecNormalize) and isinstance(wrapper.venv, VecEnvWrapper):
+                own, cls = vars(wrapper.venv), type(wrapper.venv)
+                for name, check in {"step_wait": checked_step, "reset": checked_reset}.items():
+                    if name not in own:
+                        # In this form a copy of the environments calls its own
+                        own[name] = partial(check, partial(getattr(cls, name), wrapper.venv))
+                        stack.callback(own.pop, name, None)
         if wrappers and not isinstance(env, Guard):
             guard = Guard(cast(VecEnv, env), any(isinstance(wrapper, VecNormalize) for wrapper in wrappers))
             wrappers[-1].venv = cast(VecEnv, guard)
@@ -87,10 +96,7 @@ class Guard:
 
     def reset(self) -> VecEnvObs:
         """Reset the environments."""
-        obs = self.venv.reset()
-        if self.has_statistics:
-            check_finite("The observation", obs, (None,))
-        return obs
+        return checked_reset(self.venv.reset) if self.has_statistics else self.venv.reset()
 
     def step_async(self, actions: np.ndarray) -> None:
         """
@@ -102,13 +108,8 @@ class Guard:
 
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step."""
-        obs, rewards, dones, infos = self.stepper(self.actions)
-        if self.has_statistics:
-            check_finite("The reward", rewards, (None,))
-            check_finite("The observation", obs, (None,))
-            for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
-                check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
-        return obs, rewards, dones, infos
+        step = partial(self.stepper, self.actions)
+        return checked_step(step) if self.has_statistics else step()
 
     def step(self, actions: np.ndarray) -> VecEnvStepReturn:
         """
@@ -125,3 +126,42 @@ class Guard:
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy of the environments is not guarded
         return cast, (VecEnv, self.venv)
+
+
+def check_numbers(obs: VecEnvObs, rewards: np.ndarray, dones: np.ndarray, infos: Any) -> VecEnvStepReturn:
+    """
+    Check that what a step returned is finite.
+
+    :param obs: What the step returned, as are all others
+    :param rewards: Shape ``(n_envs,)``
+    :param dones: Shape ``(n_envs,)``
+    :param infos: The infos of the environments
+    :raises BadData: Naming the environment
+    """
+    check_finite("The reward", rewards, (None,))
+    check_finite("The observation", obs, (None,))
+    for i in np.flatnonzero(dones).tolist() if np.count_nonzero(dones) else ():
+        check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
+    return obs, rewards, dones, infos
+
+
+def checked_step(step: Callable[[], VecEnvStepReturn]) -> VecEnvStepReturn:
+    """
+    What a step returns, checked.
+
+    :param step: The step
+    :raises BadData: If it returns a number that is not finite
+    """
+    return check_numbers(*step())
+
+
+def checked_reset(reset: Callable[[], VecEnvObs]) -> VecEnvObs:
+    """
+    What a reset returns, checked.
+
+    :param reset: The reset
+    :raises BadData: If it returns a number that is not finite
+    """
+    obs = reset()
+    check_finite("The observation", obs, (None,))
+    return obs

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import sys
 import traceback
 import weakref
 from functools import partial
@@ -71,29 +72,31 @@ class Watched:
             return None
         try:
             answer = self.answer()
-            self.check(question, answer)
+            answer = self.checked(question, answer)
         except BaseException:
             # The others' answers are left to the next question, not to ``close``
             self.workers.waiting = False
             raise
         return answer
 
-    def check(self, question: str, answer: Any) -> None:
+    def checked(self, question: str, answer: Any) -> Any:
         """
         Check what the environment returned.
 
         :param question: What it was asked for
         :param answer: What it answered
+        :return: The answer, its reward as a number
         :raises BadData: If that is malformed
         """
         space = self.workers.observation_space
         if question in ("step", "reset"):
             check_observation(space, answer[0], self.env)
         if question == "step":
-            _, reward, done, info, _ = answer
-            as_reward(reward, self.env)
+            obs, reward, done, info, reset_info = answer
             if done:
                 check_observation(space, info["terminal_observation"], self.env)
+            return obs, as_reward(reward, self.env), done, info, reset_info
+        return answer
 
     def answer(self) -> Any:
         """
@@ -173,7 +176,8 @@ def note_last_exception(note: Path) -> str:
     print_exc = traceback.print_exc
 
     def print_and_note(*args: Any, **kwargs: Any) -> None:
-        note.write_text(traceback.format_exc(limit=0).splitlines()[-1], encoding="utf-8")
+        lines = traceback.format_exception_only(*sys.exc_info()[:2])
+        note.write_text("".join(lines).strip(), encoding="utf-8")
         print_exc(*args, **kwargs)
 
     # What multiprocessing calls with the exception that a process ends with

@@ -436,6 +436,59 @@ def test_a_nested_vec_normalize_is_guarded_too(kind):
     assert all(np.isfinite(part).all() for env in (inner, outer) for part in statistics(env))
 
 
+class Spoiling(VecEnvWrapper):
+    """
+    Makes of finite numbers ones that are not.
+
+    :param what: Which numbers
+    :param at: The step at which it does so; the reset if 0
+    """
+
+    def __init__(self, env, what, at):
+        super().__init__(env)
+        self.what, self.at, self.n_steps = what, at, 0
+
+    def reset(self):
+        obs = self.venv.reset()
+        obs[1, 0] = NAN if self.at == 0 else obs[1, 0]
+        self.at = -1 if self.at == 0 else self.at
+        return obs
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.n_steps += 1
+        if self.n_steps == self.at:
+            {"reward": rewards, "observation": obs[:, 0]}[self.what][1] = NAN
+        return obs, rewards, dones, infos
+
+
+@all_kinds
+@pytest.mark.parametrize(("what", "at"), [("reward", 11), ("observation", 11), ("observation", 0)])
+def test_what_a_wrapper_below_vec_normalize_makes_of_the_numbers(what, at, kind):
+    spoiling = Spoiling(VecMonitor(of_two()), what, at)
+    env = VecNormalize(spoiling)
+    model = make(kind, env)
+    with pytest.raises(ValueError, match=f"{what} of environment 1 is not finite"):
+        model.learn(400)
+    assert all(np.isfinite(part).all() for part in statistics(env))
+    assert not vars(spoiling).keys() & {"step_wait", "reset"}
+    assert model.learn(32, reset_num_timesteps=False).num_timesteps >= 32
+
+
+@all_kinds
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
+@pytest.mark.parametrize(
+    ("fault", "value"), [("reward", 1e200), ("reward", -1e60), ("observation", np.full(LENGTH, -1e200))]
+)
+def test_numbers_beyond_float32_are_not_taken_for_finite_ones(fault, value, wrapper, kind):
+    space = spaces.Box(-INF, INF, (LENGTH,), np.float64)
+    env = wrapper(of_two(fault=fault, at=20, value=value, observation_space=space))
+    model = make(kind, env)
+    told = rf"{fault} of .*environment 1.* is not finite"
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match=told):
+        model.learn(400)
+
+
 @all_kinds
 def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
     """They can be asked, saved and copied while a model learns, and a copy leads a life of its own."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from environments import Corridor
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE
 
@@ -139,3 +139,18 @@ def test_the_first_observation_of_a_worker(workers):
 
     with pytest.raises(ValueError, match=r"observation of environment 1 must have shape \(7,\)"):
         learn(workers(lambda: Odd(wait), lambda: Short(wait)))
+
+
+def test_rewards_that_are_arrays_of_one_number(workers):
+    env = VecNormalize(workers(*[lambda: Corridor((7,), reward=lambda t, action: np.ones(1))] * 3))
+    learn(env)
+    assert env.ret_rms.mean.shape == () and env.returns.shape == (3,)
+
+
+def raise_lines(obs, info):
+    raise RuntimeError("first line\nsecond line\n")
+
+
+def test_the_whole_of_a_workers_exception_is_told(workers):
+    with pytest.raises(ConnectionError, match=r"RuntimeError: first line\nsecond line$"):
+        learn(workers(lambda: Odd(raise_lines)))
