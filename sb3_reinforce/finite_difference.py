@@ -31,7 +31,7 @@ from sb3_reinforce.interruptions import uninterrupted
 from sb3_reinforce.linear_policy import LinearPolicy
 from sb3_reinforce.normalization import frozen
 from sb3_reinforce.persistence import Persistent
-from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation, new_generator
 from sb3_reinforce.prediction import predict
 from sb3_reinforce.search_settings import (
     check_candidates,
@@ -169,7 +169,7 @@ class FiniteDifference(Persistent):
     def _setup_model(self) -> None:
         check_finite_difference(self)
         self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
+        super().set_random_seed(self.seed)
         policy_class = cast(type[ActorCriticPolicy], self.policy_class)
         policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         self.policy = policy.to(self.device)
@@ -177,8 +177,17 @@ class FiniteDifference(Persistent):
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, self.n_parameters)
         if self._generator is None:
-            # Seeded by the global generator, which the seed has just set
-            self._generator = th.Generator().manual_seed(int(th.randint(2**31, ())))
+            self._generator = new_generator()
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Seed the global generators, the environments and the perturbations.
+
+        :param seed: The seed; None changes nothing
+        """
+        super().set_random_seed(seed)
+        if seed is not None:
+            self._generator = new_generator()
 
     @property
     def theta(self) -> th.Tensor:

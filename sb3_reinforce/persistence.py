@@ -82,7 +82,7 @@ class Persistent(BaseAlgorithm):
         if "_random_state" not in check_archive(path, ("data", "policy.pth")) and restore_random_state:
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         model = super().load(path, env, *args, **kwargs)
-        if kwargs.get("seed") is not None:
+        if kwargs.get("seed") is not None and not restore_random_state:
             # A generator that was saved goes on from the seed before
             model.set_random_seed(model.seed)
         if restore_random_state:

@@ -15,6 +15,11 @@ import torch as th
 Perturbation: TypeAlias = Callable[[int, int, th.Generator], th.Tensor]
 
 
+def new_generator() -> th.Generator:
+    """A source of randomness of its own, seeded by PyTorch's global one."""
+    return th.Generator().manual_seed(int(th.randint(2**31, ())))
+
+
 def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
     """
     One parameter at a time: ``δ = ± e_j``.
