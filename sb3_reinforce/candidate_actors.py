@@ -188,8 +188,10 @@ def actor_class(policy: ActorCriticPolicy) -> type[MatrixActor]:
     own_code = any(overrides(policy, method) for method in ACTION_METHODS)
     if own_code or type(policy.mlp_extractor) is not MlpExtractor or type(policy.action_dist) not in DISTRIBUTIONS:
         return LoopActor
+    # A temperature is a hook
     plain = all(
-        layer.bias is not None if type(layer) is th.nn.Linear else not list(layer.parameters())
+        (layer.bias is not None if type(layer) is th.nn.Linear else not list(layer.parameters()))
+        and not layer._forward_hooks
         for layer in layers_of(policy)
     )
     extractor = policy.pi_features_extractor

@@ -19,7 +19,7 @@ class LinearPolicy(ActorCriticPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param kwargs: As for ``ActorCriticPolicy``
-    :raises ValueError: If ``net_arch`` asks for hidden layers
+    :raises ValueError: If ``net_arch`` asks for hidden layers, or observations are dicts
     """
 
     def __init__(
@@ -31,5 +31,9 @@ class LinearPolicy(ActorCriticPolicy):
     ):
         if kwargs.get("net_arch"):
             raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={kwargs['net_arch']!r}: use MlpPolicy")
+        if isinstance(observation_space, spaces.Dict):
+            raise ValueError(
+                f"LinearPolicy needs observations in one array, got {observation_space}: use MultiInputPolicy"
+            )
         super().__init__(observation_space, action_space, lr_schedule, **{**kwargs, "net_arch": []})
         th.nn.init.zeros_(cast(th.Tensor, self.action_net.bias)).requires_grad_(False)

@@ -8,10 +8,15 @@ without a display.
 from collections.abc import Mapping
 from statistics import NormalDist
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
+
+try:
+    import matplotlib.pyplot as plt
+    from matplotlib.axes import Axes
+    from matplotlib.ticker import NullLocator
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("sb3_reinforce.plots needs matplotlib: pip install 'sb3-reinforce[plots]'") from error
 
 from sb3_reinforce.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.comparisons import BaselineRow
@@ -57,7 +62,8 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     ax.axvline(table["floor"].variance.value, color=COLOURS[3], linestyle="--", label="best constant per component")
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
-    ax.set(xscale="log", xlabel="variance of one episode's gradient", title=table.title)
+    ax.set(xscale="log", xlabel="variance of one episode's gradient")
+    ax.set_title(table.title, wrap=True)
     ax.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), frameon=False)
     return ax
 
@@ -157,7 +163,7 @@ def plot_variances(
         ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
-    ax.minorticks_off()
+    ax.xaxis.set_minor_locator(NullLocator())
     ax.grid(axis="y", alpha=0.3)
     ax.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
     return ax

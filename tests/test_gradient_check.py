@@ -55,6 +55,29 @@ def test_other_policies_and_arguments_pass(policy, env, kwargs):
     assert table.passed, table
 
 
+@pytest.mark.parametrize("scale", [1e-7, 1.0, 1e4])
+def test_gradients_of_any_size_pass(scale):
+    """Also where a step along them is less than the rounding of the parameters."""
+    env = make_vec_env(lambda: Corridor((3, 7), lambda t, action: scale * (1.0 + t + action)), 2, seed=0)
+    table = check_gradient(REINFORCE("MlpPolicy", env, device="cpu", seed=0, baseline="none"))
+    assert table.passed, table
+
+
+class Magnified(Corridor):
+    """Observations in the thousands."""
+
+    def observe(self):
+        return 1e4 * super().observe()
+
+
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
+def test_policies_that_are_curved_much_pass(activation_fn):
+    env = make_vec_env(lambda: Magnified((3, 7), lambda t, action: 1.0 + t + action), 2, seed=0)
+    policy_kwargs = {"activation_fn": activation_fn}
+    table = check_gradient(REINFORCE("MlpPolicy", env, device="cpu", seed=0, policy_kwargs=policy_kwargs))
+    assert table["scores"].passed and table["surrogate"].passed, table
+
+
 def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
     env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=1, discrete=True)
     seen, forward = [], NatureCNN.forward

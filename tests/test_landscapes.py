@@ -33,6 +33,15 @@ def test_the_utility_is_that_of_the_sampling_policy():
     assert utility(thetas.reshape(1, 3, -1)).shape == (1, 3)
 
 
+def test_the_utility_is_that_of_a_policy_with_a_temperature():
+    model = bandit(temperature=0.2)
+    with th.no_grad():
+        model.policy.action_net.bias += th.tensor([0.0, 0.3])
+        expected = model.policy.get_distribution(th.ones(1, 1)).distribution.probs[0, 1]
+    utility = CandidateUtility(model, 1000, seed=0)
+    np.testing.assert_allclose(utility(utility.theta[None]).numpy(), expected, atol=0.06)
+
+
 def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
     """Asked of a model with γ = ½, which is set aside."""
     gradients, n_steps = likelihood_ratio(make_model(), 4000)

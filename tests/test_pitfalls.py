@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import PitfallCallback
-from sb3_reinforce.diagnostics.pitfalls import PITFALLS
+from sb3_reinforce.diagnostics.pitfalls import PITFALLS, randomness
 from sb3_reinforce.diagnostics.updates import Seen, Update
 
 
@@ -198,6 +198,26 @@ def test_small_noise_weights_are_not_a_deterministic_policy():
     assert "deterministic_too_early" not in found
     found = fall("Pendulum-v1", 1000, use_sde=True, policy_kwargs={"log_std_init": -9.0}, normalize_advantage=True)
     assert "deterministic_too_early" in found
+
+
+def test_noise_wider_than_the_actions_is_all_the_randomness_there_is():
+    space = spaces.Box(-0.1, 0.1, (1,))
+    assert [randomness(space, update) for update in seen([{"std": 1.0}, {"std": 0.5}]).updates] == [1.0, 1.0]
+
+
+class Own(spaces.Discrete):
+    """A space of the user's."""
+
+
+def test_a_callback_serves_one_model_after_another():
+    callback, env = PitfallCallback(), lambda: Corridor((4,), noise, action_space=Own(2))
+    for _ in range(2):
+        model = REINFORCE(
+            "MlpPolicy", make_vec_env(env, 1, seed=0), n_episodes=1, baseline="none", device="cpu", seed=0
+        )
+        with pytest.warns(UserWarning, match="n_episodes"):
+            model.learn(400, callback)
+        assert callback.n_updates == model._n_updates and "too_few_episodes" in callback.found
 
 
 def test_a_schedule_is_told_by_its_present_value():

@@ -52,6 +52,12 @@ def test_it_logs_every_so_many_rollouts():
     assert -1 <= history["gradient/cosine"][0] <= 1
 
 
+def test_it_serves_one_model_after_another():
+    callback = GradientQualityCallback(1)
+    histories = [train(callback).logger.history for _ in range(2)]
+    assert histories[0] == histories[1]
+
+
 def test_the_variance_is_that_of_the_episodes_gradients():
     callback = GradientQualityCallback(1)
     model = train(callback, 1, baseline="none", n_episodes=8, learning_rate=0.0)

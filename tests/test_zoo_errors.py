@@ -74,6 +74,7 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm", "normalize must be Python, but of 'nn.Norm'"),
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
         ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
+        ("policy: CnnPolicy, n_timesteps: 100", "You should use NatureCNN only with images"),
     ],
 )
 def test_a_wrong_setting_is_named(

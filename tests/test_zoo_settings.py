@@ -3,6 +3,8 @@
 import argparse
 import importlib
 import inspect
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -12,10 +14,12 @@ import pytest
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("matplotlib")
 
+import gymnasium as gym
 import optuna
 import rl_zoo3
 import torch as th
 import yaml
+from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -71,6 +75,37 @@ def test_a_default_is_fitted_to_the_spaces(env: str, left_out: set[str], tmp_pat
     default = {"policy": "MlpPolicy", "n_timesteps": 32, "temperature": "lin_1", "normalize": True}
     train("reinforce", *conf(tmp_path, default=default), env=env)
     assert default.keys() - config_of(tmp_path / "reinforce" / f"{env}_1").keys() == left_out
+
+
+class Dicts(gym.ObservationWrapper[Any, Any, Any]):
+    """Observations in a dict, with one that cannot be normalized."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = spaces.Dict({"obs": env.observation_space, "one": spaces.Discrete(2)})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        return {"obs": observation, "one": 1}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_default_trains_on_dicts(name: str, tmp_path: Path) -> None:
+    gym.register("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
+    try:
+        train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="Dicts-v0")
+    finally:
+        del gym.registry["Dicts-v0"]
+    config = config_of(tmp_path / name / "Dicts-v0_1")
+    assert config["policy"] == "MultiInputPolicy" and "normalize" not in config
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_model_can_be_loaded_without_the_zoo(name: str, tmp_path: Path) -> None:
+    entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1") | {"policy": "MlpPolicy", "n_timesteps": 64}
+    train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
+    path, algorithm = str(tmp_path / name / RUN / "CartPole-v1.zip"), ALGORITHMS[name].__name__
+    code = f"import sys; sys.modules['rl_zoo3'] = None; import sb3_reinforce as s; s.{algorithm}.load({path!r})"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

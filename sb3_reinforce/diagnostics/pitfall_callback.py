@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections import deque
-from typing import cast
+from typing import Any, cast
 
 import torch as th
 from gymnasium import spaces
@@ -38,13 +38,17 @@ class PitfallCallback(BaseCallback):
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
         self.found: dict[str, str] = {}
-        self.updates: deque[Update] = deque(maxlen=50)
-        self.n_updates = 0
-        self.rollout: Rollout | None = None
-        self.parameters: Parameters = []
+        self.seen_model: Any = None
 
     def _init_callback(self) -> None:
         check_model(self.model)
+        # What is known of a model lasts for all its training, and is not told of another
+        if self.model is not self.seen_model:
+            self.seen_model, self.found = self.model, {}
+            self.updates: deque[Update] = deque(maxlen=50)
+            self.n_updates = 0
+            self.rollout: Rollout | None = None
+            self.parameters: Parameters = []
 
     def _on_step(self) -> bool:
         return True

@@ -148,7 +148,9 @@ def deterministic_too_early(seen: Seen) -> str | None:
     """
     left, share = seen.model._current_progress_remaining, randomness(seen.model.action_space, seen.updates[-1])
     if left > 0.5 and share < 0.05:
-        remedy = "raise min_std" if isinstance(seen.model.action_space, spaces.Box) else "raise temperature"
+        remedy = "raise temperature"
+        if isinstance(seen.model.action_space, spaces.Box):
+            remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
         return (
             f"With {left:.0%} of the training left the policy is all but deterministic ({share:.1%} of the randomness "
             f"that it could have), and its scores vanish. Raise ent_coef (now "
@@ -159,19 +161,20 @@ def deterministic_too_early(seen: Seen) -> str | None:
 
 def randomness(space: spaces.Space[Any], update: Update) -> float:
     """
-    The entropy by the largest possible one, or for a Box the standard deviation by half of the mean width.
+    The entropy by the largest possible one, or for a Box the standard deviation by half of the mean width, at most 1.
 
     :param space: The action space
     :param update: The update
     :return: NaN where it is not known
     """
     if isinstance(space, spaces.Box):
-        return update.std / float((space.high - space.low).mean() / 2)
-    largest = {
-        spaces.Discrete: lambda: math.log(space.n),  # type: ignore[attr-defined]
-        spaces.MultiDiscrete: lambda: float(np.log(space.nvec).sum()),  # type: ignore[attr-defined]
-        spaces.MultiBinary: lambda: math.log(2) * float(np.prod(space.shape)),  # type: ignore[arg-type]
-    }[type(space)]()
+        return min(1.0, update.std / float((space.high - space.low).mean() / 2))
+    if isinstance(space, spaces.Discrete):
+        largest = math.log(space.n)
+    elif isinstance(space, spaces.MultiDiscrete):
+        largest = float(np.log(space.nvec).sum())
+    else:
+        largest = math.log(2) * math.prod(space.shape or ())
     return update.entropy / largest if largest > 0 else float("nan")
 
 

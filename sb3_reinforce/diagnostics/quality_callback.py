@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -61,11 +61,13 @@ class GradientQualityCallback(BaseCallback):
         self.every = check_integer("every", every, 1)
         self.max_episodes = check_integer("max_episodes", max_episodes, 2)
         self.baselines = baselines
-        self.n_rollouts = 0
-        self.thetas: list[th.Tensor] = []
-        self.parameters: Parameters = []
+        self.seen_model: Any = None
 
     def _init_callback(self) -> None:
+        if self.model is not self.seen_model:
+            self.seen_model, self.n_rollouts = self.model, 0
+            self.thetas: list[th.Tensor] = []
+            self.parameters: Parameters = []
         if isinstance(self.model, FiniteDifference):
             return
         check_model(self.model)

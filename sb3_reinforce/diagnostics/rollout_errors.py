@@ -74,7 +74,7 @@ def weight_error(sampler: REINFORCE, rollout: Rollout) -> float:
 
 def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     """
-    The step of ``train()`` at rate 1, without entropy bonus, normalization and clipping, against
+    The step of ``train()``, without entropy bonus, normalization and clipping, against
     ``Σ w_t γ^t ∇ log π / denominator``.
 
     :param sampler: The model that collected; its policy is trained
@@ -85,10 +85,12 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     ) / sampler._denominator(rollout)
     parameters = scored_parameters(rollout)
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
-    sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=1.0)
-    sampler.lr_schedule = FloatSchedule(1.0)
+    # As long as θ, where the gradient is shorter: a short step would drown in the rounding of θ
+    rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
+    sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=rate)
+    sampler.lr_schedule = FloatSchedule(rate)
     sampler.ent_coef, sampler.vf_coef, sampler.max_grad_norm, sampler.min_std = 0.0, 0.0, None, 0.0  # type: ignore[assignment]
     sampler.critic_learning_rate, sampler.normalize_advantage, sampler._sorted_parameters = 0.0, False, ()
     sampler._make_critic_optimizer()
     sampler.train()
-    return relative(th.nn.utils.parameters_to_vector(parameters).detach() - before, expected)
+    return relative(th.nn.utils.parameters_to_vector(parameters).detach() - before, rate * expected)

@@ -165,8 +165,15 @@ def main() -> None:
         missing = (error.name or "").partition(".")[0]
         hint = "it comes with pip install 'sb3-reinforce[zoo]'" if missing in EXTRA else "install it, or mend its name"
         parser.error(f"{error}: {hint}")
-    except (ConfigurationError, gym.error.DependencyNotInstalled) as error:
+    except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))
+    except ValueError as error:
+        if command != "plot_from_file" or "empty sequence" not in str(error):
+            raise
+        parser.error(
+            "no algorithm has two runs with evaluations at the same steps: all_plots keeps only such runs, and with "
+            "--max-timesteps more of them"
+        )
 
 
 if __name__ == "__main__":

@@ -65,6 +65,9 @@ def setup_experiment(zoos: Method, manager: ExperimentManager) -> Any:
     """
     try:
         return zoos(manager)
+    except AssertionError as error:
+        # Of Stable-Baselines3, of a policy and the spaces that it does not go with
+        raise ConfigurationError(str(error)) from error
     except (TypeError, ValueError) as error:
         names = settings(manager.algo) | (manager._hyperparams.get("policy_kwargs") or {}).keys()
         pattern = r"(?:^Invalid value for |^|, got |unexpected keyword argument ')(\w+)"
@@ -149,26 +152,31 @@ def _fitting(default: Settings, manager: ExperimentManager) -> Settings:
     wrap = rl_zoo3.get_wrapper_class(given)
     env = wrap(env) if wrap else env
     env.close()
-    unfit = set()
-    if not isinstance(env.observation_space, (spaces.Box, spaces.Dict)):
+    space, unfit = env.observation_space, set()
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    if not all(isinstance(part, spaces.Box) for part in parts):
         unfit.add("normalize")
     if isinstance(env.action_space, spaces.Box):
         unfit.add("temperature")
-    return {key: value for key, value in default.items() if key not in unfit}
+    fitting = {key: value for key, value in default.items() if key not in unfit}
+    return fitting | ({"policy": "MultiInputPolicy"} if isinstance(space, spaces.Dict) else {})
 
 
 def _preprocess_hyperparams(zoos: Method, manager: ExperimentManager, hyperparams: Settings) -> tuple[Any, ...]:
     """
-    Turn texts into what they stand for as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule:
-    the Zoo does so only in ``learning_rate`` and ``delta_std``.
+    Turn texts into what they stand for as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule.
+
+    The Zoo does so only in ``learning_rate`` and ``delta_std``, and with a class of its own, without which a model
+    could not be loaded.
 
     :param zoos: The Zoo's method
     :param manager: The experiment
     :param hyperparams: The settings
     :return: The Zoo's result
     """
-    processed, *others = zoos(manager, hyperparams)
-    for key in scheduled(manager.algo) & processed.keys():
-        if isinstance(processed[key], str) and (start := LINEAR.fullmatch(processed[key])):
-            processed[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
-    return processed, *others
+    linear = {}
+    for key in scheduled(manager.algo) & hyperparams.keys():
+        if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):
+            linear[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
+    processed, *others = zoos(manager, {key: value for key, value in hyperparams.items() if key not in linear})
+    return processed | linear, *others
