@@ -167,7 +167,8 @@ def write(rows: Any, step: int, values: Any) -> None:
         for key, part in rows.items():
             write(part, step, values[key])
     else:
-        rows[step] = values.reshape(rows.shape[1:])
+        # Actions and observations of one number lack the last dimension
+        rows[step] = values if values.ndim == rows.ndim - 1 else values.reshape(rows.shape[1:])
 
 
 def resize(buffer: RolloutBuffer, n_steps: int) -> None:

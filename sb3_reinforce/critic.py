@@ -48,8 +48,10 @@ def values_after(policy: ActorCriticPolicy, values: Floats, last_obs: Any, ends:
     :return: Shape ``(n_steps, n_envs)``
     """
 
+    value = value_function(policy)
+
     def predict(obs: Any) -> Floats:
-        return value_function(policy)(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
+        return value(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
 
     following = np.where(ends.dones, 0.0, np.vstack([values[1:], predict(last_obs)]))
     if ends.terminal_obs:
@@ -130,13 +132,14 @@ def what_learns(
     :param obs: ``n`` observations
     :return: ``n`` observations or features, and V as a function of as many of them as one likes
     """
-    if critic_layers(policy) is not None:
-        return obs, value_function(policy)
+    value = value_function(policy)
+    if value != policy.predict_values:
+        return obs, value
     extractor, changed = policy.vf_features_extractor, {id(parameter) for parameter in parameters}
     # In training mode Dropout draws anew for each pass, and BatchNorm looks at each minibatch
     is_fixed = type(extractor) is FlattenExtractor or not extractor.training
     if overrides(policy, "predict_values") or not is_fixed or not changed.isdisjoint(map(id, extractor.parameters())):
-        return obs, policy.predict_values
+        return obs, value
     with th.no_grad():
         features = BasePolicy.extract_features(policy, obs, extractor)
     return features, lambda features: policy.value_net(policy.mlp_extractor.forward_critic(features))
