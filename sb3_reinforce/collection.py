@@ -64,7 +64,8 @@ def collect(
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
     as_env_actions, step, is_heard = env_actions_of(policy), stepper(env), hears(callback)
-    all_dones: list[Bools] = []
+    # A copy: some VecEnvs reuse the array of the dones
+    first, all_dones = np.array(model._last_episode_starts, dtype=bool), list[Bools]()
     terminal_obs: dict[tuple[int, int], Any] = {}
     owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
     deadline, waiting = extent.max_episode_steps, True
@@ -81,7 +82,6 @@ def collect(
         actions, values, log_probs = actor.act(model._last_obs)
         write(rollout_buffer.observations, n_steps, model._last_obs)
         write(rollout_buffer.actions, n_steps, actions)
-        rollout_buffer.episode_starts[n_steps] = model._last_episode_starts
         if values is not None and log_probs is not None:
             write(rollout_buffer.values, n_steps, values)
             write(rollout_buffer.log_probs, n_steps, log_probs)
@@ -95,7 +95,7 @@ def collect(
             callback.update_locals(locals())
             if not callback.on_step():
                 return None
-        # After the callback, which may have changed the rewards in place; some VecEnvs reuse the array of the dones
+        # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
         all_dones.append(dones.astype(bool))
         if np.count_nonzero(dones):
@@ -111,11 +111,12 @@ def collect(
                 deadline = extent.max_episode_steps + begun[owed > 0].min(initial=n_steps + 1)
         rollout_buffer.pos = n_steps = n_steps + 1
     resize(rollout_buffer, n_steps)
-    rollout_buffer.full = True
+    rollout_buffer.full, ends = True, np.stack(all_dones)
+    rollout_buffer.episode_starts[:] = np.vstack([first, ends[:-1]])
     if log_probs is None and is_heard:
         shape = rollout_buffer.rewards.shape
         rollout_buffer.log_probs = actor.log_prob(rollout_buffer.observations, rollout_buffer.actions).reshape(shape)
-    return Ends(np.stack(all_dones), terminal_obs)
+    return Ends(ends, terminal_obs)
 
 
 def hears(callback: BaseCallback) -> bool:

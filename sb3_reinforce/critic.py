@@ -1,6 +1,6 @@
 """The critic: its values along a rollout, and its regression on the returns by an optimizer of its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -113,12 +113,25 @@ def fit_critic(
     inputs, predict_values = what_learns(policy, parameters, obs)
     with optimization.kept_finite(parameters, "critic"):
         for _ in range(n_updates):
-            for batch in th.randperm(len(returns)).to(returns.device).split(batch_size):  # type: ignore[no-untyped-call]
+            for batch in minibatches(len(returns), batch_size, returns.device):
                 loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])
                 gradients = th.autograd.grad(loss, parameters)
                 optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
                 losses.append(loss.detach())
     return float(th.stack(losses).mean())
+
+
+def minibatches(n: int, size: int, device: th.device) -> Sequence[th.Tensor | slice]:
+    """
+    The steps of each minibatch, drawn without replacement; all of them in one are not put into another order.
+
+    :param n: Number of steps
+    :param size: Size of a minibatch; the last one may be smaller
+    :param device: Where the steps are
+    """
+    if size >= n:
+        return [slice(None)]
+    return th.randperm(n).to(device).split(size)  # type: ignore[no-untyped-call, no-any-return]
 
 
 def what_learns(

@@ -45,6 +45,15 @@ def step(
     return norm
 
 
+def in_a_row(parameters: Sequence[th.nn.Parameter]) -> th.Tensor:
+    """
+    A copy of all values, shape ``(n,)``.
+
+    :param parameters: The parameters, in any memory format
+    """
+    return th.cat([parameter.detach().flatten() for parameter in parameters])
+
+
 @contextmanager
 def kept_finite(parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
     """
@@ -56,14 +65,14 @@ def kept_finite(parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[No
     :param name: What they belong to, for the message
     :raises ValueError: If one of them is not finite
     """
-    before = [parameter.detach().clone() for parameter in parameters]
+    before = in_a_row(parameters)
     try:
         yield
     finally:
-        if not th.cat([parameter.detach().flatten() for parameter in parameters]).isfinite().all():
+        if not in_a_row(parameters).isfinite().all():
             with th.no_grad():
-                for parameter, old in zip(parameters, before, strict=True):
-                    parameter.copy_(old)
+                for parameter, old in zip(parameters, th.split(before, [p.numel() for p in parameters]), strict=True):
+                    parameter.copy_(old.view_as(parameter))
             raise ValueError(
                 f"A step made a parameter of the {name} that is not finite. The parameters are those before it; a "
                 "lower learning_rate, other optimizer_kwargs or scaled rewards (VecNormalize) may help"

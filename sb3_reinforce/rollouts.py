@@ -102,12 +102,12 @@ def flatten(tensors: TensorOrDict) -> TensorOrDict:
     return tensors.flatten(0, 1) if isinstance(tensors, th.Tensor) else {k: v.flatten(0, 1) for k, v in tensors.items()}
 
 
-def take(tensors: TensorOrDict, steps: th.Tensor) -> TensorOrDict:
+def take(tensors: TensorOrDict, steps: th.Tensor | slice) -> TensorOrDict:
     """
     Some of the steps.
 
     :param tensors: Shape ``(n, ...)`` or ``(n_steps, n_envs, ...)``, or a dict of such tensors
-    :param steps: The indices, or a mask of shape ``(n_steps, n_envs)``
+    :param steps: The indices, a slice, or a mask of shape ``(n_steps, n_envs)``
     :return: These steps in a row, or a dict of such tensors
     """
     return tensors[steps] if isinstance(tensors, th.Tensor) else {key: part[steps] for key, part in tensors.items()}
