@@ -124,6 +124,9 @@ def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[st
         low, high = np.ravel(intervals[name])
         axis.barh(row, high - low, left=low, height=0.5, color=color(name), alpha=0.5)
         axis.plot(2 * [float(value)], [row - 0.25, row + 0.25], color="black")
+    # An interval that begins at the edge of the picture would look cut
+    axis.use_sticky_edges = False
+    axis.autoscale_view()
     axis.set_yticks(range(len(values)), [LABELS.get(name, name) for name in values])
     axis.invert_yaxis()
 
