@@ -22,12 +22,27 @@ def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -
     if rewards.shape != (n_envs,) or rewards.dtype.kind not in "biuf":
         got = f"shape {rewards.shape} and dtype {rewards.dtype}"
         raise BadData(f"The rewards must be {n_envs} numbers, one for each environment, got {got}")
-    for part in obs.values() if isinstance(obs, dict) else (obs,):
+    parts = obs if isinstance(obs, dict) else {"": obs}
+    spaces_of = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    for part in parts.values():
         if np.shape(part)[:1] != (n_envs,):
             raise BadData(f"The observations must be those of {n_envs} environments, got shape {np.shape(part)}")
-    if not (type(space) is spaces.Box and obs.shape[1:] == space.shape and obs.dtype == space.dtype):
+    # Copy by copy only what is not seen from the batch
+    if not parts.keys() >= spaces_of.keys() or not all(fits(part, parts[key]) for key, part in spaces_of.items()):
         for i in range(n_envs):
             check_observation(space, one_of(obs, i), i)
+
+
+def fits(space: spaces.Space[Any], batch: Any) -> bool:
+    """
+    Whether observations are of a form that a Box has.
+
+    :param space: The space of one
+    :param batch: The observations of all copies
+    """
+    values = np.asarray(batch)
+    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
+    return type(space) is spaces.Box and values.shape[1:] == space.shape and values.dtype.kind in kinds
 
 
 def one_of(obs: Any, i: int) -> Any:

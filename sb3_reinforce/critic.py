@@ -111,7 +111,7 @@ def fit_critic(
         return 0.0
     losses = []
     inputs, predict_values = what_learns(policy, parameters, obs)
-    with optimization.kept_finite(parameters, "critic"):
+    with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
             for batch in minibatches(len(returns), batch_size, returns.device):
                 loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])

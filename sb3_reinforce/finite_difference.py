@@ -362,7 +362,7 @@ class FiniteDifference(Persistent):
             gradient = gradient * self._delta_std / utility_std
         # The optimizer descends: here, and only here, the sign turns
         loss_gradient = [part[0] for part in parameters.split(-gradient[None], self._actor_parameters)]
-        with optimization.kept_finite(self._actor_parameters, "policy"):
+        with optimization.kept_finite(self.policy.optimizer, self._actor_parameters, "policy"):
             grad_norm = optimization.step(
                 self.policy.optimizer, self._actor_parameters, loss_gradient, self.max_grad_norm, "utility"
             )

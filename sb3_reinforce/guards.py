@@ -64,8 +64,9 @@ def watched(env: VecEnv | None) -> Iterator[None]:
             wrappers.append(env)
             env = env.venv
         for wrapper in wrappers:
-            # What another wrapper has made of finite numbers may not be finite
-            if isinstance(wrapper, VecNormalize) and isinstance(wrapper.venv, VecEnvWrapper):
+            # What another wrapper has made of finite numbers may not be finite, but what VecNormalize has, is
+            is_checked = isinstance(wrapper.venv, VecNormalize)
+            if isinstance(wrapper, VecNormalize) and isinstance(wrapper.venv, VecEnvWrapper) and not is_checked:
                 own, cls = vars(wrapper.venv), type(wrapper.venv)
                 for name, check in {"step_wait": checked_step, "reset": checked_reset}.items():
                     if name not in own:

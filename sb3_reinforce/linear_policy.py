@@ -19,7 +19,8 @@ class LinearPolicy(ActorCriticPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param kwargs: As for ``ActorCriticPolicy``
-    :raises ValueError: If ``net_arch`` asks for hidden layers, or observations are dicts
+    :raises ValueError: If ``net_arch`` asks for hidden layers, or observations are dicts that no features extractor
+        puts in a row
     """
 
     def __init__(
@@ -31,7 +32,7 @@ class LinearPolicy(ActorCriticPolicy):
     ):
         if kwargs.get("net_arch"):
             raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={kwargs['net_arch']!r}: use MlpPolicy")
-        if isinstance(observation_space, spaces.Dict):
+        if isinstance(observation_space, spaces.Dict) and "features_extractor_class" not in kwargs:
             raise ValueError(
                 f"LinearPolicy needs observations in one array, got {observation_space}: use MultiInputPolicy"
             )

@@ -55,12 +55,14 @@ def in_a_row(parameters: Sequence[th.nn.Parameter]) -> th.Tensor:
 
 
 @contextmanager
-def kept_finite(parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
+def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
     """
     Parameters that are changed within the block become what they were before it, if one of them is not finite after it.
+    The optimizer, whose moments may not be finite either, then begins anew.
 
     A finite gradient can do that: Adam without its ``eps`` divides 0 by 0, and weight decay may be too large.
 
+    :param optimizer: What changes them
     :param parameters: The parameters
     :param name: What they belong to, for the message
     :raises ValueError: If one of them is not finite
@@ -73,9 +75,11 @@ def kept_finite(parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[No
             with th.no_grad():
                 for parameter, old in zip(parameters, th.split(before, [p.numel() for p in parameters]), strict=True):
                     parameter.copy_(old.view_as(parameter))
+            optimizer.state.clear()
             raise ValueError(
-                f"A step made a parameter of the {name} that is not finite. The parameters are those before it; a "
-                "lower learning_rate, other optimizer_kwargs or scaled rewards (VecNormalize) may help"
+                f"A step made a parameter of the {name} that is not finite. The parameters are those before it, and "
+                "the optimizer begins anew; a lower learning_rate, other optimizer_kwargs or scaled rewards (VecNormalize) "
+                "may help"
             )
 
 

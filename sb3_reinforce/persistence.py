@@ -144,7 +144,7 @@ class Persistent(BaseAlgorithm):
             super().set_parameters(own, exact_match, device)
             for name in own:
                 if isinstance(part := recursive_getattr(self, name), th.optim.Optimizer):
-                    check_optimizer(name, part, before[name]["state"])
+                    check_optimizer(name, part, before[name])
         except BaseException:
             super().set_parameters(before, device=device)
             raise
@@ -181,26 +181,28 @@ def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
             yield from numbers(f"{name}.{key}", part)
 
 
-def check_optimizer(name: str, optimizer: th.optim.Optimizer, before: Mapping[Any, Mapping[str, Any]]) -> None:
+def check_optimizer(name: str, optimizer: th.optim.Optimizer, before: Mapping[str, Any]) -> None:
     """
     Check that an optimizer has kept its settings, and that its moments are those of its parameters: a fused one would
     write beyond moments of another shape.
 
     :param name: Its name
     :param optimizer: The optimizer with its new state
-    :param before: The moments that it had
+    :param before: The state that it had
     :raises ValueError: If a setting is missing or of another kind, or moments do not go with the parameters
     """
     other = f"load_path_or_dict[{name!r}] must be the state of a {type(optimizer).__name__} for this policy, but"
     for group in optimizer.param_groups:
-        for setting, default in optimizer.defaults.items():
+        for setting, old in before["param_groups"][0].items():
             if setting not in group:
                 raise ValueError(f"{other} it has no {setting}: it is that of another optimizer")
-            if isinstance(default, (float, tuple)) and type(group[setting]) not in (type(default), list, int):
+            if isinstance(old, (float, tuple)) and type(group[setting]) not in (type(old), list, int):
                 raise ValueError(f"{other} its {setting} is {group[setting]!r}")
-    moments = {key for each in before.values() for key in each}
-    for parameter, state in optimizer.state.items():
-        shapes = {value.shape for value in state.values() if isinstance(value, th.Tensor) and value.dim()}
-        if not shapes <= {parameter.shape} or not state.keys() >= moments:
-            got = ", ".join(f"{key} of shape {tuple(np.shape(value))}" for key, value in state.items())
-            raise ValueError(f"{other} for a parameter of shape {tuple(parameter.shape)} it has {got or 'nothing'}")
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    for index, moments in optimizer.state_dict()["state"].items():
+        # Those of some optimizers have a shape of their own
+        known = {key: np.shape(value) for key, value in before["state"].get(index, {}).items()}
+        for key in known.keys() | (moments.keys() if optimizer.defaults.get("fused") else ()):
+            expected, got = known.get(key, tuple(parameters[index].shape)), np.shape(moments.get(key))
+            if key not in moments or (got and got != expected):
+                raise ValueError(f"{other} its {key} of parameter {index} must have shape {expected}, got {got}")

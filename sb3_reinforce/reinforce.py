@@ -345,7 +345,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         if values is not None:
             loss = loss + self.vf_coef * F.mse_loss(values, steps.returns)
         gradient = th.autograd.grad(loss, actor, allow_unused=True)
-        with optimization.kept_finite(actor, "policy"):
+        with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
             grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
         # The temperature is that of the progress made, with which a saved model will be loaded
         self._apply_temperature_and_floor()

@@ -192,7 +192,7 @@ class GymnasiumVecEnv(VecEnv):
         :raises NotImplementedError: If the vector environment has no copies that could be called, or only all at once
         """
         copies, wanted = getattr(self.env.unwrapped, "envs", None), list(self._get_indices(indices))
-        if copies is None and len(wanted) == self.num_envs and hasattr(self.env.unwrapped, "call"):
+        if copies is None and wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
             return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
         if copies is None:
             raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")

@@ -37,8 +37,9 @@ class Watched:
         # With a reference to its owner, the folder of the notes would wait for the garbage collector
         self.workers: Any = weakref.proxy(workers)
         self.question = ""
-        # A worker may die in the middle of an answer that does not fit into the pipe
-        remote._recv = partial(remote._recv, read=self.read)
+        # A worker may die in the middle of an answer that does not fit into the pipe; those of Windows are others
+        if hasattr(remote, "_recv"):
+            remote._recv = partial(remote._recv, read=self.read)
 
     def send(self, message: tuple[str, Any]) -> None:
         """

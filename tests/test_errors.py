@@ -336,7 +336,11 @@ EXPLODING = {
     "steps": {"policy_kwargs": {"net_arch": [4], "optimizer_kwargs": {"eps": 0.0}}},
     "search": {
         "learning_rate": 1.0,
-        "policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"weight_decay": 1e12}},
+        "policy_kwargs": {
+            "net_arch": [4],
+            "optimizer_class": th.optim.SGD,
+            "optimizer_kwargs": {"weight_decay": 1e12, "momentum": 0.9},
+        },
     },
 }
 

@@ -19,6 +19,7 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
 from sb3_reinforce import storage
 
@@ -268,6 +269,16 @@ WRONG = {
         },
     },
 }
+
+
+@both
+@pytest.mark.parametrize("optimizer", [RMSpropTFLike, th.optim.Adafactor, th.optim.SGD, th.optim.AdamW])
+def test_the_states_of_other_optimizers_are_their_own(optimizer, kind, tmp_path):
+    model = make(kind, Corridor(), policy_kwargs={"net_arch": [4], "optimizer_class": optimizer}).learn(32)
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", env=Corridor())
+    assert plain(loaded.get_parameters()) == plain(model.get_parameters())
+    loaded.learn(32)
 
 
 @both

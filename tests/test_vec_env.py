@@ -274,6 +274,13 @@ def test_malformed_steps_are_named(change, message, wrapper, monkeypatch):
     assert model.learn(100).num_timesteps >= 100
 
 
+@pytest.mark.parametrize("form", [list, lambda obs: obs.astype(np.float64)])
+def test_forms_that_stand_for_observations_are_taken(form, monkeypatch):
+    monkeypatch.setattr(Malformed, "change", staticmethod(lambda obs, rewards: (form(obs), rewards)))
+    env = Malformed([lambda: gym.make("CartPole-v1")] * N_ENVS, autoreset_mode="SameStep")
+    assert REINFORCE("MlpPolicy", GymnasiumVecEnv(env), n_steps=16, device="cpu").learn(100).num_timesteps >= 100
+
+
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
 def test_episodes_that_gymnasium_records(mode):
     vector_env = SyncVectorEnv([lambda: Corridor((4,))] * N_ENVS, autoreset_mode=mode)
@@ -303,9 +310,10 @@ def test_the_infos_of_a_reset_are_those_of_the_last_one(mode):
 
 def test_methods_of_copies_in_other_processes():
     env = GymnasiumVecEnv(AsyncVectorEnv([lambda: Corridor((4,))] * 2, autoreset_mode="SameStep"))
-    assert [repr(unwrapped) for unwrapped in env.env_method("has_wrapper_attr", "lengths")] == ["True"] * 2
-    with pytest.raises(NotImplementedError):
-        env.env_method("has_wrapper_attr", "lengths", indices=[0])
+    assert env.env_method("has_wrapper_attr", "lengths") == [True] * 2
+    for indices in ([0], [1, 0], [0, 0]):
+        with pytest.raises(NotImplementedError):
+            env.env_method("has_wrapper_attr", "lengths", indices=indices)
     env.close()
 
 
