@@ -78,8 +78,8 @@ def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parame
             optimizer.state.clear()
             raise ValueError(
                 f"A step made a parameter of the {name} that is not finite. The parameters are those before it, and "
-                "the optimizer begins anew; a lower learning_rate, other optimizer_kwargs or scaled rewards (VecNormalize) "
-                "may help"
+                "the optimizer begins anew; a lower learning_rate, other optimizer_kwargs or scaled rewards "
+                "(VecNormalize) may help"
             )
 
 
