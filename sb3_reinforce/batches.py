@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_reinforce.environment_checks import BadData, check_observation
+from sb3_reinforce.environment_checks import BadData, check_observation, has_form
 
 
 def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -> None:
@@ -41,8 +41,7 @@ def fits(space: spaces.Space[Any], batch: Any) -> bool:
     :param batch: The observations of all copies
     """
     values = np.asarray(batch)
-    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
-    return type(space) is spaces.Box and values.shape[1:] == space.shape and values.dtype.kind in kinds
+    return type(space) is spaces.Box and has_form(space, values.shape[1:], values.dtype)
 
 
 def one_of(obs: Any, i: int) -> Any:

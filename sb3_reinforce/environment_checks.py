@@ -151,6 +151,17 @@ def as_reward(reward: Any, env: int) -> float:
     return float(values.item())
 
 
+def has_form(space: spaces.Space[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
+    """
+    Whether an array may stand for an observation: integers for real numbers, but no fractions for integers.
+
+    :param space: The observation space
+    :param shape: The array's shape
+    :param dtype: Its dtype
+    """
+    return shape == space.shape and dtype.kind in ("biuf" if np.dtype(space.dtype).kind == "f" else "biu")
+
+
 def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
     """
     Check the form of an observation, which a VecEnv would stretch, cut or round to that of the space without a word.
@@ -175,9 +186,7 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
         values = np.asarray(obs)
     except ValueError as error:
         raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
-    # Integers may stand for real numbers, but numbers with a fraction not for integers
-    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
-    if values.shape != space.shape or values.dtype.kind not in kinds:
+    if not has_form(space, values.shape, values.dtype):
         raise BadData(
             f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
             f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"

@@ -87,6 +87,14 @@ def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
     assert max(seen) <= 2**21 // 84**2
 
 
+def test_weights_in_another_memory_format_pass():
+    env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=3, discrete=True)
+    model = REINFORCE("CnnPolicy", env, baseline="none", n_episodes=2, device="cpu", seed=0)
+    model.policy.to(memory_format=th.channels_last)
+    table = check_gradient(model, 2)
+    assert table.passed, table
+
+
 def test_gsde_cuts_its_scores_unless_it_learns_features():
     """Stable-Baselines3 detaches the features that the standard deviation depends on: not the gradient of log π."""
     model = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, device="cpu", seed=0)

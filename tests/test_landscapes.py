@@ -1,5 +1,8 @@
 """Utilities on a plane, estimators at one θ, and the pictures of what was measured."""
 
+import importlib
+import sys
+
 import numpy as np
 import pytest
 import torch as th
@@ -50,6 +53,13 @@ def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
     assert n_steps == 8000
     error = gradients.mean(0) - truth.T.flatten()
     assert (error.abs() <= 4.5 * gradients.std(0) / 4000**0.5).all()
+
+
+def test_pictures_without_matplotlib_say_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "sb3_reinforce.plots", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sb3-reinforce\[plots\]'"):
+        importlib.import_module("sb3_reinforce.plots")
 
 
 @pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])

@@ -317,9 +317,12 @@ def test_methods_of_copies_in_other_processes():
     env.close()
 
 
-def test_environments_of_one_class_with_different_modes():
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_environments_of_one_class_with_different_modes(mode, monkeypatch):
     """Gymnasium has had the mode of the last one in what they share."""
-    env = SyncVectorEnv([Corridor] * 2, autoreset_mode="SameStep")
-    shared, env.metadata["autoreset_mode"] = env.metadata["autoreset_mode"], AutoresetMode.NEXT_STEP
-    GymnasiumVecEnv(env)
-    env.metadata["autoreset_mode"] = shared
+    env = SyncVectorEnv([lambda: Corridor((1,))] * 2, autoreset_mode=mode)
+    monkeypatch.setitem(env.metadata, "autoreset_mode", AutoresetMode.NEXT_STEP)
+    adapter = GymnasiumVecEnv(env)
+    adapter.reset()
+    # Each step is a whole episode, with no step in between that only resets
+    assert [adapter.step(np.zeros(2, int))[2].tolist() for _ in range(3)] == [[True, True]] * 3

@@ -1,5 +1,6 @@
 """What the Zoo's commands say of a wrong command, a wrong configuration and a missing package."""
 
+import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +11,12 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("matplotlib")
 
 import rl_zoo3
+import stable_baselines3
 from huggingface_hub.errors import HTTPError
 from rl_zoo3.exp_manager import ExperimentManager
 from zoo_commands import train, zoo
+
+from sb3_reinforce.zoo import __main__
 
 # The Zoo and what it calls warn of their own affairs
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -150,6 +154,22 @@ def test_a_benchmark_without_network_is_told_of_no_hub(
 ) -> None:
     monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", raising(error))
     assert "does not answer (no network): pass --no-hub" in message_of(capsys, "benchmark", "--log-dir", str(tmp_path))
+
+
+def test_plots_of_runs_that_cannot_be_compared_say_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = importlib.import_module(__main__.FUNCTIONS["plot_from_file"])
+    monkeypatch.setattr(module, "plot_from_file", raising(ValueError("min() arg is an empty sequence")))
+    assert "all_plots keeps only such runs, and with --max-timesteps" in message_of(capsys, "plot_from_file", "-i", "x")
+
+
+def test_a_missing_tensorboard_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(stable_baselines3.common.utils, "SummaryWriter", None)
+    arguments = ("train", "--algo", "reinforce", "-f", str(tmp_path), "-n", "100", "-tb", str(tmp_path / "tb"))
+    assert "tensorboard is not installed" in message_of(capsys, *arguments)
 
 
 def test_a_package_of_the_extra_that_is_missing_is_named(

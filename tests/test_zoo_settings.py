@@ -104,8 +104,10 @@ def test_a_model_can_be_loaded_without_the_zoo(name: str, tmp_path: Path) -> Non
     entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1") | {"policy": "MlpPolicy", "n_timesteps": 64}
     train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
     path, algorithm = str(tmp_path / name / RUN / "CartPole-v1.zip"), ALGORITHMS[name].__name__
-    code = f"import sys; sys.modules['rl_zoo3'] = None; import sb3_reinforce as s; s.{algorithm}.load({path!r})"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+    code = "import sys; sys.modules['rl_zoo3'] = None; import sb3_reinforce as s"
+    code += f"; print(s.{algorithm}.load({path!r}).learning_rate(0.5))"
+    told = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.split()[-1] == "0.25"
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

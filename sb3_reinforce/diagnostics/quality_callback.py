@@ -14,6 +14,7 @@ from sb3_reinforce.diagnostics.comparisons import functions_of
 from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
 from sb3_reinforce.finite_difference import FiniteDifference
+from sb3_reinforce.optimization import in_a_row
 from sb3_reinforce.policies import Parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
@@ -84,7 +85,7 @@ class GradientQualityCallback(BaseCallback):
         else:
             rollout = cast(Rollout, cast(REINFORCE, model)._rollout)
             self.parameters = self.parameters or scored_parameters(rollout)
-            theta = th.nn.utils.parameters_to_vector(self.parameters).detach().clone()
+            theta = in_a_row(self.parameters)
         self.thetas, self.n_rollouts = [*self.thetas[-2:], theta], self.n_rollouts + 1
         if self.n_rollouts % self.every == 0:
             figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)

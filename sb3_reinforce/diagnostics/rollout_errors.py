@@ -7,6 +7,7 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from sb3_reinforce.critic import stack
 from sb3_reinforce.diagnostics.policy_errors import relative
 from sb3_reinforce.diagnostics.sampling import Infos, training_weights
+from sb3_reinforce.optimization import in_a_row
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.rollouts import Rollout
 from sb3_reinforce.scores import gradients_by_episode, scored_parameters
@@ -84,7 +85,7 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
         0
     ) / sampler._denominator(rollout)
     parameters = scored_parameters(rollout)
-    before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
+    before = in_a_row(parameters)
     # As long as θ, where the gradient is shorter: a short step would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=rate)
@@ -93,4 +94,4 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     sampler.critic_learning_rate, sampler.normalize_advantage, sampler._sorted_parameters = 0.0, False, ()
     sampler._make_critic_optimizer()
     sampler.train()
-    return relative(th.nn.utils.parameters_to_vector(parameters).detach() - before, rate * expected)
+    return relative(in_a_row(parameters) - before, rate * expected)
