@@ -78,6 +78,8 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm", "normalize must be Python, but of 'nn.Norm'"),
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
         ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
+        ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: 3", "env_kwargs must be a dict, got 3"),
+        ("policy: MlpPolicy, n_timesteps: 100, frame_stack: a", "frame_stack must be an integer, got 'a'"),
         ("policy: CnnPolicy, n_timesteps: 100", "You should use NatureCNN only with images"),
     ],
 )

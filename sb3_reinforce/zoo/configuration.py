@@ -70,7 +70,10 @@ def check_hyperparams(algorithm: str, hyperparams: dict[str, Any], optimize: boo
             _check_text(key, value, key in scheduled(algorithm))
     for key in hyperparams.keys() & {"normalize", "policy_kwargs", "monitor_kwargs"}:
         _check_dict(key, hyperparams[key])
-    check_integer("n_envs", hyperparams.get("n_envs", 1), 1)
+    if not isinstance(hyperparams.get("env_kwargs", {}), dict):
+        raise ConfigurationError(f"env_kwargs must be a dict, got {hyperparams['env_kwargs']!r}")
+    for key in ("n_envs", "frame_stack"):
+        check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
     if optimize and (hyperparams.get("n_episodes") or hyperparams.get("baseline", "value") != "value"):
         raise ConfigurationError(
