@@ -5,7 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 
 from sb3_reinforce.arguments import as_integers, check_flag, check_integer, check_kind, check_number
 
@@ -55,6 +57,9 @@ def check_basics_of(model: Any) -> None:
     :raises TypeError: If one is of the wrong kind
     :raises ValueError: If one is out of its range
     """
+    space = model.observation_space
+    if model.policy_class is MultiInputActorCriticPolicy and not isinstance(space, spaces.Dict):
+        raise ValueError(f"policy must be MlpPolicy or CnnPolicy for observations in {space}, got MultiInputPolicy")
     window, log = model._stats_window_size, model.tensorboard_log
     check_basics(model.policy_class, model.policy_kwargs, window, log, model.verbose, model.seed, model.device)
     as_integers(model, {"_stats_window_size": 1} | ({} if model.seed is None else {"seed": 0}))

@@ -214,3 +214,9 @@ def test_actions_of_two_dimensions(kind):
     env.action_space = spaces.MultiDiscrete([[2, 3], [4, 5]])
     with pytest.raises(ValueError, match="MultiDiscrete action space must have one dimension"):
         make(kind, env)
+
+
+@both
+def test_a_policy_for_dicts_needs_them(kind):
+    with pytest.raises(ValueError, match="policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
+        make(kind, Corridor(), "MultiInputPolicy")
