@@ -218,5 +218,5 @@ def test_actions_of_two_dimensions(kind):
 
 @both
 def test_a_policy_for_dicts_needs_them(kind):
-    with pytest.raises(ValueError, match="policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
+    with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
         make(kind, Corridor(), "MultiInputPolicy")
