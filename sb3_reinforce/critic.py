@@ -1,6 +1,7 @@
 """The critic: its values along a rollout, and its regression on the returns by an optimizer of its own."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
 
 from sb3_reinforce import optimization
+from sb3_reinforce.backpropagation import activations, squared_error
 from sb3_reinforce.collection import Ends
 from sb3_reinforce.layers import critic_layers, overrides
-from sb3_reinforce.passes import through
 from sb3_reinforce.policies import Parameters, tells_values
 from sb3_reinforce.returns import Floats
 from sb3_reinforce.rollouts import flatten, take
@@ -62,12 +63,13 @@ def values_after(policy: ActorCriticPolicy, values: Floats, last_obs: Any, ends:
 
 def value_function(policy: ActorCriticPolicy) -> Callable[[Any], th.Tensor]:
     """
-    V as a function of ``n`` observations, of shape ``(n, 1)``: the policy's own, or a plain MLP's in less time.
+    V as a function of ``n`` observations, of shape ``(n, 1)``: the policy's own, or a plain MLP's in less time. It is
+    called where autograd records nothing.
 
     :param policy: The policy
     """
     layers = critic_layers(policy)
-    return policy.predict_values if layers is None else lambda obs: through(layers, obs.flatten(1).float())
+    return policy.predict_values if layers is None else lambda obs: activations(layers, obs.flatten(1).float())[-1]
 
 
 def stack(observations: list[Any]) -> Any:
@@ -110,14 +112,13 @@ def fit_critic(
     if not parameters:
         return 0.0
     losses = []
-    inputs, predict_values = what_learns(policy, parameters, obs)
+    inputs, error_and_gradients = regression(policy, parameters, obs)
     with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
             for batch in minibatches(len(returns), batch_size, returns.device):
-                loss = F.mse_loss(predict_values(take(inputs, batch)).flatten(), returns[batch])
-                gradients = th.autograd.grad(loss, parameters)
+                error, gradients = error_and_gradients(take(inputs, batch), returns[batch])
                 optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
-                losses.append(loss.detach())
+                losses.append(error)
     return float(th.stack(losses).mean())
 
 
@@ -134,6 +135,30 @@ def minibatches(n: int, size: int, device: th.device) -> Sequence[th.Tensor | sl
     return th.randperm(n).to(device).split(size)  # type: ignore[no-untyped-call, no-any-return]
 
 
+def regression(
+    policy: ActorCriticPolicy, parameters: Parameters, obs: PyTorchObs
+) -> tuple[PyTorchObs, Callable[[Any, th.Tensor], tuple[th.Tensor, Sequence[th.Tensor]]]]:
+    """
+    What a pass of the critic computes.
+
+    :param policy: The policy
+    :param parameters: The parameters that the critic's passes change
+    :param obs: ``n`` observations
+    :return: ``n`` inputs, and the mean squared error and its gradient as a function of any number of them and of as
+        many returns
+    """
+    layers = critic_layers(policy)
+    if layers is not None:
+        return obs.flatten(1).float(), partial(squared_error, layers, parameters)  # type: ignore[union-attr]
+    inputs, value = what_learns(policy, parameters, obs)
+
+    def by_autograd(inputs: Any, returns: th.Tensor) -> tuple[th.Tensor, Sequence[th.Tensor]]:
+        error = F.mse_loss(value(inputs).flatten(), returns)
+        return error.detach(), th.autograd.grad(error, parameters)
+
+    return inputs, by_autograd
+
+
 def what_learns(
     policy: ActorCriticPolicy, parameters: Parameters, obs: PyTorchObs
 ) -> tuple[PyTorchObs, Callable[[Any], th.Tensor]]:
@@ -145,14 +170,11 @@ def what_learns(
     :param obs: ``n`` observations
     :return: ``n`` observations or features, and V as a function of as many of them as one likes
     """
-    value = value_function(policy)
-    if value != policy.predict_values:
-        return obs, value
     extractor, changed = policy.vf_features_extractor, {id(parameter) for parameter in parameters}
     # In training mode Dropout draws anew for each pass, and BatchNorm looks at each minibatch
     is_fixed = type(extractor) is FlattenExtractor or not extractor.training
     if overrides(policy, "predict_values") or not is_fixed or not changed.isdisjoint(map(id, extractor.parameters())):
-        return obs, value
+        return obs, policy.predict_values
     with th.no_grad():
         features = BasePolicy.extract_features(policy, obs, extractor)
     return features, lambda features: policy.value_net(policy.mlp_extractor.forward_critic(features))

@@ -1,4 +1,7 @@
-"""Which policies are plain MLPs, so that ``passes`` computes what they would, and which have code of their own."""
+"""
+Which policies are plain MLPs, so that ``passes`` and ``backpropagation`` compute what they would, and which have code
+of their own.
+"""
 
 from typing import Any
 
@@ -87,7 +90,7 @@ def plain_layers(
     :param extractor: Its features extractor
     :param net: Name of the network that follows in the ``MlpExtractor``
     :param head: The last layer
-    :return: None if there is anything else on the way, a forward hook or another ``forward``
+    :return: None if there is anything else on the way, a hook or another ``forward``, or a parameter in two layers
     """
     space, mlp = policy.observation_space, policy.mlp_extractor
     if type(mlp) is not MlpExtractor or not isinstance(space, spaces.Box) or is_image_space(space):
@@ -97,16 +100,26 @@ def plain_layers(
         return None
     layers = [*body, head]
     is_plain = all(is_plain_layer(layer) for layer in layers) and not any(map(is_changed, (extractor, body, *layers)))
-    return layers if is_plain else None
+    return layers if is_plain and not share_parameters(layers) else None
 
 
 def is_plain_layer(layer: th.nn.Module) -> bool:
     """
-    Whether a layer is one that ``passes`` knows.
+    Whether a layer is one that ``passes`` and ``backpropagation`` know.
 
     :param layer: Any layer
     """
     return type(layer) in (th.nn.Tanh, th.nn.ReLU) or (type(layer) is th.nn.Linear and layer.bias is not None)
+
+
+def share_parameters(layers: list[th.nn.Module]) -> bool:
+    """
+    Whether two layers have a parameter in common.
+
+    :param layers: The layers of a plain MLP
+    """
+    linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
+    return len({id(part) for layer in linear for part in (layer.weight, layer.bias)}) < 2 * len(linear)
 
 
 def is_changed(module: th.nn.Module) -> bool:
@@ -116,4 +129,5 @@ def is_changed(module: th.nn.Module) -> bool:
     :param module: Any module
     """
     own_hooks = [hook for hook in module._forward_hooks.values() if not isinstance(hook, DivideLogits)]
-    return bool(own_hooks or module._forward_pre_hooks) or "forward" in vars(module)
+    other_hooks = (module._forward_pre_hooks, module._backward_pre_hooks, module._backward_hooks)
+    return any((own_hooks, *other_hooks, "forward" in vars(module)))

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_reinforce.backpropagation import activations, deltas
 from sb3_reinforce.layers import actor_layers, overrides
 from sb3_reinforce.policies import Parameters, as_policy_actions
 from sb3_reinforce.rollouts import Rollout, select
@@ -28,14 +29,9 @@ def factored_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
     The actor's layers, if the scores of its parameters have factors.
 
     :param policy: The policy
-    :return: As ``actor_layers``; None also where ``evaluate_actions`` is overridden, two layers share a parameter, or a
-        temperature comes after a layer
+    :return: As ``actor_layers``; None also where ``evaluate_actions`` is overridden
     """
-    layers = actor_layers(policy)
-    if layers is None or overrides(policy, "evaluate_actions") or any(layer._forward_hooks for layer in layers):
-        return None
-    parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    return layers if len(set(parameters)) == len(parameters) else None
+    return None if overrides(policy, "evaluate_actions") else actor_layers(policy)
 
 
 def mlp_gradients(
@@ -94,18 +90,21 @@ def factors(
     :param obs: Shape ``(n, n_features)``
     :param actions: ``n`` actions
     """
-    x, log_std = obs, []
+    with th.no_grad():
+        xs = activations(layers, obs)
+    inputs = [xs[-1].requires_grad_()]
+    has_std = isinstance(policy.action_dist, DiagGaussianDistribution)
+    if has_std:
+        inputs.append(policy.log_std.detach().expand_as(xs[-1]).requires_grad_())
+    log_prob = policy.action_dist.proba_distribution(*inputs).log_prob(actions)
     found: dict[th.Tensor, Factors] = {}
-    for layer in layers:
-        before, x = x.detach(), layer(x)
-        if isinstance(layer, th.nn.Linear):
-            found[layer.weight], found[layer.bias] = (x, before), (x, None)
-    if isinstance(policy.action_dist, DiagGaussianDistribution):
-        log_std = [policy.log_std.expand_as(x)]
-        found[policy.log_std] = (log_std[0], None)
-    log_prob = policy.action_dist.proba_distribution(x, *log_std).log_prob(actions)
-    deltas = th.autograd.grad(log_prob.sum(), [found[parameter][0] for parameter in parameters])
-    return [(delta, found[parameter][1]) for parameter, delta in zip(parameters, deltas, strict=True)]
+    delta, *delta_std = th.autograd.grad(log_prob.sum(), inputs)
+    if has_std:
+        found[policy.log_std] = (delta_std[0], None)
+    with th.no_grad():
+        for layer, d, x in deltas(layers, xs, delta):
+            found[layer.weight], found[layer.bias] = (d, x), (d, None)
+    return [found[parameter] for parameter in parameters]
 
 
 def weighted_sum(w: th.Tensor, delta: th.Tensor, x: th.Tensor | None) -> th.Tensor:

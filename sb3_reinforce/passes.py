@@ -1,9 +1,7 @@
 """
-Passes through plain MLPs: the arithmetic of their modules, in less time.
+Passes through plain MLPs for a handful of observations, as a few NumPy operations.
 
-On a handful of observations PyTorch's modules take far longer than the arithmetic, so without a gradient a pass is a
-few NumPy operations. On thousands its tanh takes ten times as long as NumPy's, so with a gradient a pass is PyTorch's
-but for tanh.
+PyTorch's modules take far longer there than the arithmetic. For many observations see ``backpropagation``.
 """
 
 from collections.abc import Callable
@@ -78,32 +76,3 @@ def product(layer: th.nn.Linear, x: Floats, out: Floats) -> Callable[[], Any]:
     if x.shape[1] * weights.numel() > ONE_THREAD:
         return partial(th.mm, weights, th.from_numpy(x), out=th.from_numpy(out))
     return partial(np.dot, weights.numpy(), x, out)
-
-
-def through(layers: list[th.nn.Module], x: th.Tensor) -> th.Tensor:
-    """
-    The layers one after the other, so that gradients can be taken.
-
-    :param layers: ``Linear``, ``Tanh`` and ``ReLU`` layers
-    :param x: Shape ``(n, n_in)``
-    :return: Shape ``(n, width)``
-    """
-    for layer in layers:
-        is_slow = isinstance(layer, th.nn.Tanh) and x.device.type == "cpu"
-        x = Tanh.apply(x) if is_slow else layer(x)  # type: ignore[no-untyped-call]
-    return x
-
-
-class Tanh(th.autograd.Function):
-    """tanh on a CPU, by NumPy; ``tanh' = 1 − tanh²``."""
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
-        y = th.from_numpy(np.tanh(x.detach().numpy()))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
-        (y,) = ctx.saved_tensors
-        return th.ops.aten.tanh_backward(gradient, y)  # type: ignore[no-any-return]

@@ -200,6 +200,16 @@ def test_whatever_is_not_plain_goes_the_general_way():
     assert actor_layers(th.compile(make_policy(), backend="eager")) is None
 
 
+@pytest.mark.parametrize("name", ["mlp_extractor.policy_net.2", "action_net"])
+@pytest.mark.parametrize("hook", ["register_full_backward_hook", "register_full_backward_pre_hook"])
+def test_backward_hooks_are_called(name, hook):
+    """Users log gradients with them."""
+    model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
+    getattr(model.policy.get_submodule(name), hook)(lambda *args: calls.append(1))
+    model.learn(8)
+    assert calls
+
+
 def test_images_go_the_general_way():
     """They are scaled to [0, 1] before they are flattened."""
     model = REINFORCE("MlpPolicy", FakeImageEnv(screen_height=36, screen_width=36), device="cpu")
