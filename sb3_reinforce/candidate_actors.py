@@ -37,7 +37,7 @@ class MatrixActor:
 
     def __init__(self, policy: ActorCriticPolicy, actor: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool):
         self.policy, self.actor, self.deterministic, self.device = policy, actor, deterministic, policy.device
-        self._as_env_actions = env_actions_of(policy)
+        self._as_env_actions = env_actions_of(policy, n_envs)
         # Matrices lie in memory as they are multiplied, transposed, which halves the price of a product
         self.stacks = [p.detach().mT.repeat(n_envs, 1, 1).mT if p.dim() == 2 else repeated(p, n_envs) for p in actor]
         self._stack_of = {id(p): stack for p, stack in zip(actor, self.stacks, strict=True)}

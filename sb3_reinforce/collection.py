@@ -63,7 +63,7 @@ def collect(
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
-    as_env_actions, step, is_heard = env_actions_of(policy), stepper(env), hears(callback)
+    as_env_actions, step, is_heard = env_actions_of(policy, env.num_envs), stepper(env), hears(callback)
     # A copy: some VecEnvs reuse the array of the dones
     first, all_dones = np.array(model._last_episode_starts, dtype=bool), list[Bools]()
     terminal_obs: dict[tuple[int, int], Any] = {}
@@ -111,7 +111,7 @@ def collect(
                 deadline = extent.max_episode_steps + begun[owed > 0].min(initial=n_steps + 1)
         rollout_buffer.pos = n_steps = n_steps + 1
     resize(rollout_buffer, n_steps)
-    rollout_buffer.full, ends = True, np.stack(all_dones)
+    rollout_buffer.full, ends = True, np.array(all_dones)
     rollout_buffer.episode_starts[:] = np.vstack([first, ends[:-1]])
     if log_probs is None and is_heard:
         shape = rollout_buffer.rewards.shape
@@ -128,16 +128,18 @@ def hears(callback: BaseCallback) -> bool:
     return not (type(callback) is ConvertCallback and callback.callback is None)
 
 
-def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarray]:
+def env_actions_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[np.ndarray], np.ndarray]:
     """
     How the policy's actions become those of the environment: clipped or unscaled to a Box, shifted to a discrete start.
 
     :param policy: The policy
+    :param n_envs: Number of environments
     :return: A function of actions of shape ``(n_envs, *action_space.shape)``
     """
     space = policy.action_space
     if isinstance(space, spaces.Box):
-        low, high = space.low, space.high
+        # Bounds for each environment: to broadcast them at each step takes longer than to clip
+        low, high = (np.repeat(bound[None], n_envs, axis=0) for bound in (space.low, space.high))
         return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(low, high)
     if np.any(getattr(space, "start", 0)):
         return lambda actions: shift_to_start(space, actions)

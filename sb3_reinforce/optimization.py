@@ -38,7 +38,10 @@ def step(
             "lower learning_rate, a max_grad_norm or scaled rewards (VecNormalize) may help"
         )
     scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
-    optimizer.zero_grad()
+    # What zero_grad does, without its bookkeeping, which takes a fourth of the time of all this
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            parameter.grad = None
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient if gradient is None or scale == 1 else gradient * scale
     optimizer.step()
@@ -71,7 +74,7 @@ def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parame
     try:
         yield
     finally:
-        if not in_a_row(parameters).isfinite().all():
+        if not math.isfinite(th.linalg.vector_norm(in_a_row(parameters), ord=math.inf)):
             with th.no_grad():
                 for parameter, old in zip(parameters, th.split(before, [p.numel() for p in parameters]), strict=True):
                     parameter.copy_(old.view_as(parameter))

@@ -110,8 +110,9 @@ def weigh(
         buffer.values = values_of(policy, buffer)
         next_values = values_after(policy, buffer.values, last_obs, ends)
     returns_to_go = lambda_return(rewards, dones, next_values, gamma, weighing.gae_lambda)
-    total_returns = total_return(returns_to_go, timesteps, gamma, running.rewards)
-    returns = returns_to_go if weighing.reward_to_go else total_returns
+    returns = returns_to_go
+    if not weighing.reward_to_go:
+        returns = total_return(returns_to_go, timesteps, gamma, running.rewards)
     rollout = Rollout(
         observations=obs_as_tensor(buffer.observations, policy.device),
         actions=th.as_tensor(buffer.actions, device=policy.device),
