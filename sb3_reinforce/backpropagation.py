@@ -5,8 +5,8 @@ On a few hundred observations autograd takes as long to record a pass as the pas
 times as long as NumPy's on a CPU. So the chain rule is written out (Rumelhart, Hinton and Williams, 1986): for a layer
 ``y = f(x)`` and a loss L, δ = ∂L/∂y becomes ∂L/∂x = δ ∂f/∂x, from the last layer to the first.
 
-Layers are ``Linear``, ``Tanh`` and ``ReLU``, as ``layers`` finds them, which share no parameter. All but ``through`` is
-called where autograd records nothing.
+Layers are ``Linear``, ``Tanh`` and ``ReLU``, as ``layers`` finds them, which share no parameter. A temperature is none
+of them: it divides what the last puts out. But for ``through`` and ``divided``, autograd must not record what is done.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,12 +25,15 @@ def activations(layers: list[th.nn.Module], x: th.Tensor) -> list[th.Tensor]:
     :param x: Shape ``(n, n_in)``
     :return: One more than there are layers, each of shape ``(n, width)``; what precedes a tanh may be lost
     """
-    xs, before = [x], None
+    xs, is_linear = [x], False
     for layer in layers:
-        # No derivative asks for what a linear layer put out, so the next tanh may write over it
-        x = tanh(x, in_place=isinstance(before, th.nn.Linear)) if isinstance(layer, th.nn.Tanh) else layer(x)
+        if isinstance(layer, th.nn.Tanh):
+            # No derivative asks for what a linear layer put out, so tanh may write over it
+            x = tanh(x, in_place=is_linear)
+        else:
+            x = F.linear(x, layer.weight, layer.bias) if isinstance(layer, th.nn.Linear) else x.relu()
         xs.append(x)
-        before = layer
+        is_linear = isinstance(layer, th.nn.Linear)
     return xs
 
 
@@ -48,48 +51,57 @@ def tanh(x: th.Tensor, in_place: bool) -> th.Tensor:
     return out
 
 
+def parameters_of(layers: list[th.nn.Module]) -> list[th.Tensor]:
+    """
+    W and b of each linear layer, one after the other.
+
+    :param layers: The layers
+    """
+    return [part for layer in layers if isinstance(layer, th.nn.Linear) for part in (layer.weight, layer.bias)]
+
+
 def deltas(
-    layers: list[th.nn.Module], xs: Sequence[th.Tensor], delta: th.Tensor
-) -> Iterator[tuple[th.nn.Linear, th.Tensor, th.Tensor]]:
+    layers: list[th.nn.Module], weights: Sequence[th.Tensor], xs: Sequence[th.Tensor], delta: th.Tensor
+) -> Iterator[tuple[th.Tensor, th.Tensor]]:
     """
     δ = ∂L/∂z of each linear layer ``z = W x + b``, from the last to the first.
 
-    Before it, ``∂L/∂x = δ W``; before a tanh, ``δ (1 − y²)``; before a ReLU, δ where y > 0; before a temperature,
-    ``δ / τ``.
+    Before it, ``∂L/∂x = δ W``; before a tanh, ``δ (1 − y²)``; before a ReLU, δ where y > 0.
 
     :param layers: The layers
+    :param weights: W of each linear layer
     :param xs: As ``activations`` gives them
     :param delta: ∂L/∂y of the last output y, shape ``(n, width)``
-    :return: Of each linear layer: itself, δ of shape ``(n, n_out)`` and x of shape ``(n, n_in)``
+    :return: Of each linear layer: δ of shape ``(n, n_out)`` and x of shape ``(n, n_in)``
     """
+    remaining = list(weights)
     for i, layer in reversed(list(enumerate(layers))):
         if isinstance(layer, th.nn.Linear):
-            for divide in layer._forward_hooks.values():
-                delta = divide(layer, None, delta)
-            yield layer, delta, xs[i]
-            if i > 0:
-                delta = delta @ layer.weight
+            yield delta, xs[i]
+            weight = remaining.pop()
+            delta = delta @ weight if i > 0 else delta
         elif isinstance(layer, th.nn.Tanh):
             delta = th.ops.aten.tanh_backward(delta, xs[i + 1])
         else:
             delta = th.ops.aten.threshold_backward(delta, xs[i + 1], 0)
 
 
-def gradients(layers: list[th.nn.Module], xs: Sequence[th.Tensor], delta: th.Tensor) -> dict[th.Tensor, th.Tensor]:
+def gradients(
+    layers: list[th.nn.Module], weights: Sequence[th.Tensor], xs: Sequence[th.Tensor], delta: th.Tensor
+) -> list[th.Tensor]:
     """
-    ``∂L/∂W = δᵀ x`` and ``∂L/∂b = Σ δ`` of each linear layer.
+    ``∂L/∂W = δᵀ x`` and ``∂L/∂b = Σ δ`` of each linear layer, as ``parameters_of`` has them.
 
     :param layers: The layers
+    :param weights: W of each linear layer
     :param xs: As ``activations`` gives them
     :param delta: ∂L/∂y of the last output y, shape ``(n, width)``
     """
-    found: dict[th.Tensor, th.Tensor] = {}
-    for layer, d, x in deltas(layers, xs, delta):
+    found = []
+    for d, x in deltas(layers, weights, xs, delta):
         # BLAS takes up to five times as long for a product of many rows and few columns
-        is_narrow = layer.in_features < layer.out_features
-        found[layer.weight] = (x.T @ d).T.contiguous() if is_narrow else d.T @ x
-        found[layer.bias] = d.sum(0)
-    return found
+        found += [d.sum(0), (x.T @ d).T if x.shape[1] < d.shape[1] else d.T @ x]
+    return found[::-1]
 
 
 def squared_error(
@@ -103,37 +115,53 @@ def squared_error(
     :param x: Shape ``(n, n_in)``
     :param targets: G, shape ``(n,)``
     """
+    everything = parameters_of(layers)
     with th.no_grad():
         xs = activations(layers, x)
-        found = gradients(layers, xs, (2 / len(x)) * (xs[-1] - targets[:, None]))
+        delta = (2 / len(x)) * (xs[-1] - targets[:, None])
+        found = dict(zip(everything, gradients(layers, everything[::2], xs, delta), strict=True))
         return F.mse_loss(xs[-1].flatten(), targets), [found[parameter] for parameter in parameters]
 
 
 def through(layers: list[th.nn.Module], x: th.Tensor) -> th.Tensor:
     """
-    The layers one after the other, as one operation that autograd can differentiate once by their parameters.
+    The layers one after the other, over τ where they have a temperature. Autograd can differentiate it once, by the
+    parameters; x is constant.
 
     :param layers: The layers
     :param x: Shape ``(n, n_in)``
     :return: Shape ``(n, width)``
     """
-    parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    return Mlp.apply(layers, x, *parameters)  # type: ignore[no-untyped-call, no-any-return]
+    return divided(layers, Mlp.apply(layers, x, *parameters_of(layers)))  # type: ignore[no-untyped-call]
+
+
+def divided(layers: list[th.nn.Module], outputs: th.Tensor) -> th.Tensor:
+    """
+    ``y / τ``, or y where the last layer has no temperature.
+
+    :param layers: The layers
+    :param outputs: y
+    """
+    for divide in layers[-1]._forward_hooks.values():
+        outputs = divide(layers[-1], None, outputs)
+    return outputs
 
 
 class Mlp(th.autograd.Function):
-    """``through`` as autograd sees it."""
+    """The layers one after the other, as autograd sees them."""
 
     @staticmethod
-    def forward(ctx: Any, layers: list[th.nn.Module], x: th.Tensor, *parameters: th.nn.Parameter) -> th.Tensor:
-        xs = activations(layers, x)
-        ctx.layers, ctx.n_activations = layers, len(xs)
-        ctx.save_for_backward(*xs, *parameters)
+    def forward(ctx: Any, layers: list[th.nn.Module], x: th.Tensor, *parameters: th.Tensor) -> th.Tensor:
+        xs, weights = activations(layers, x), parameters[::2]
+        ctx.layers, ctx.n_weights = layers, len(weights)
+        ctx.save_for_backward(*weights, *xs)
         return xs[-1]
 
     @staticmethod
-    @th.autograd.function.once_differentiable
     def backward(ctx: Any, delta: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        saved = ctx.saved_tensors
-        found = gradients(ctx.layers, saved[: ctx.n_activations], delta)
-        return None, None, *(found[parameter] for parameter in saved[ctx.n_activations :])
+        if th.is_grad_enabled():
+            raise NotImplementedError(
+                "The fast pass of a plain MLP has no second derivative (create_graph=True): policy.evaluate_actions has"
+            )
+        weights, xs = ctx.saved_tensors[: ctx.n_weights], ctx.saved_tensors[ctx.n_weights :]
+        return None, None, *gradients(ctx.layers, weights, xs, delta)

@@ -148,7 +148,8 @@ def regression(
         many returns
     """
     layers = critic_layers(policy)
-    if layers is not None:
+    # A user's hook on a parameter is called by autograd
+    if layers is not None and not any(parameter._backward_hooks for parameter in parameters):
         return obs.flatten(1).float(), partial(squared_error, layers, parameters)  # type: ignore[union-attr]
     inputs, value = what_learns(policy, parameters, obs)
 

@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.backpropagation import activations, deltas
+from sb3_reinforce.backpropagation import activations, deltas, divided
 from sb3_reinforce.layers import actor_layers, overrides
 from sb3_reinforce.policies import Parameters, as_policy_actions
 from sb3_reinforce.rollouts import Rollout, select
@@ -92,18 +92,19 @@ def factors(
     """
     with th.no_grad():
         xs = activations(layers, obs)
-    inputs = [xs[-1].requires_grad_()]
-    has_std = isinstance(policy.action_dist, DiagGaussianDistribution)
-    if has_std:
-        inputs.append(policy.log_std.detach().expand_as(xs[-1]).requires_grad_())
-    log_prob = policy.action_dist.proba_distribution(*inputs).log_prob(actions)
+    outputs, log_std = xs[-1].requires_grad_(), []
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        log_std = [policy.log_std.detach().expand_as(outputs).requires_grad_()]
+    log_prob = policy.action_dist.proba_distribution(divided(layers, outputs), *log_std).log_prob(actions)
+    delta, *delta_std = th.autograd.grad(log_prob.sum(), [outputs, *log_std])
+    linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
     found: dict[th.Tensor, Factors] = {}
-    delta, *delta_std = th.autograd.grad(log_prob.sum(), inputs)
-    if has_std:
-        found[policy.log_std] = (delta_std[0], None)
     with th.no_grad():
-        for layer, d, x in deltas(layers, xs, delta):
+        shares = deltas(layers, [layer.weight for layer in linear], xs, delta)
+        for layer, (d, x) in zip(reversed(linear), shares, strict=True):
             found[layer.weight], found[layer.bias] = (d, x), (d, None)
+    if delta_std:
+        found[policy.log_std] = (delta_std[0], None)
     return [found[parameter] for parameter in parameters]
 
 

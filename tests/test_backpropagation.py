@@ -5,8 +5,9 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_reinforce.backpropagation import squared_error, through
+from sb3_reinforce.backpropagation import squared_error, tanh, through
 from sb3_reinforce.layers import DivideLogits
+from sb3_reinforce.optimization import step
 
 MLPS = {
     "tanh": lambda: [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 5), nn.Tanh(), nn.Linear(5, 2)],
@@ -67,14 +68,6 @@ def test_the_squared_error_and_its_gradient(name):
     th.testing.assert_close(gradients, list(th.autograd.grad(expected, some)))
 
 
-def test_a_gradient_lies_in_memory_as_its_parameter_does(mlp):
-    """A fused optimizer goes through both side by side."""
-    layers, parameters = mlp
-    gradients = th.autograd.grad(through(layers, th.randn(7, 3)).sum(), parameters)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        assert gradient.stride() == parameter.stride()
-
-
 def test_frozen_parameters(mlp):
     layers, parameters = mlp
     parameters[0].requires_grad_(False)
@@ -84,20 +77,60 @@ def test_frozen_parameters(mlp):
     th.testing.assert_close(gradients, expected)
 
 
-def test_a_second_derivative_is_refused():
-    """It would lack what the activations contribute."""
+@pytest.mark.parametrize("loss", [lambda y: y.square().sum(), lambda y: y.sum()])
+def test_a_second_derivative_is_refused(loss):
+    """It would lack what the activations contribute, also where other terms reach all parameters."""
     layers, parameters = make_layers("tanh")
-    loss = through(layers, th.randn(7, 3)).square().sum()
-    (gradient,) = th.autograd.grad(loss, parameters[:1], create_graph=True)
-    with pytest.raises(RuntimeError, match="twice"):
-        gradient.sum().backward()
+    with pytest.raises(NotImplementedError, match=r"policy\.evaluate_actions"):
+        th.autograd.grad(loss(through(layers, th.randn(7, 3))), parameters, create_graph=True)
 
 
-def test_weights_that_have_changed_meanwhile_are_refused():
-    """Their δ would be that of a pass that was never made."""
+def test_the_gradient_is_that_of_the_pass():
+    """Whatever becomes of the modules between the pass and its gradient."""
     layers, parameters = make_layers("tanh")
+    x = th.randn(7, 3)
+    expected = th.autograd.grad(nn.Sequential(*layers)(x).sum(), parameters)
+    with th.autograd.graph.save_on_cpu():
+        output = through(layers, x)
+        layers[-1].weight = nn.Parameter(th.zeros_like(layers[-1].weight))
+        th.testing.assert_close(th.autograd.grad(output.sum(), parameters), expected)
+
+
+@pytest.mark.parametrize("changed", ["weights", "temperature"])
+def test_what_has_been_written_over_meanwhile_is_refused(changed):
+    """The δ would be that of a pass that was never made."""
+    layers, parameters = make_layers("tanh")
+    temperature = th.tensor(0.3)
+    layers[-1].register_forward_hook(DivideLogits(temperature))
     output = through(layers, th.randn(7, 3))
     with th.no_grad():
-        parameters[-2].mul_(2)
+        (parameters[-2] if changed == "weights" else temperature).mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         th.autograd.grad(output.sum(), parameters)
+
+
+def test_tanh_on_other_devices():
+    """No more can be seen of them here than that it is asked for, and where it writes."""
+    x = th.ones(2, 3, device="meta")
+    assert tanh(x, in_place=True) is x
+    assert tanh(x, in_place=False).shape == x.shape
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_step_reads_a_gradient_as_its_parameter_lies_in_memory(fused):
+    """A fused optimizer goes through both side by side."""
+    rows, columns = (nn.Parameter(w) for w in (th.arange(6.0).view(2, 3), th.arange(6.0).view(2, 3).T.contiguous().T))
+    gradient = th.tensor([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
+    assert rows.stride() != columns.stride()
+    for parameter in (rows, columns):
+        adam = th.optim.Adam([parameter], lr=0.1, fused=fused)
+        assert step(adam, [parameter], [gradient], None, "policy") == pytest.approx(6**0.5)
+    th.testing.assert_close(rows.detach(), th.arange(6.0).view(2, 3) - 0.1 * gradient)
+    assert th.equal(rows, columns)
+
+
+def test_a_step_takes_a_gradient_of_another_precision():
+    """As autocast makes it."""
+    parameter = nn.Parameter(th.zeros(2))
+    step(th.optim.SGD([parameter], lr=1.0), [parameter], [th.tensor([1.0, 2.0]).half()], None, "policy")
+    assert parameter.tolist() == [-1, -2]

@@ -119,16 +119,29 @@ def changed(name):
         policy.mlp_extractor.value_net.register_forward_hook(lambda module, inputs, output: output + 1)
     elif name == "no bias":
         policy.value_net.bias = None
+    elif name == "tied":
+        net = policy.mlp_extractor.value_net
+        net.extend([th.nn.Linear(64, 64), th.nn.Linear(64, 64)])
+        net[-1].bias = net[-2].bias
     return policy
 
 
-@pytest.mark.parametrize("name", ["as it is", "method", "class", "hook", "no bias"])
+@pytest.mark.parametrize("name", ["as it is", "method", "class", "hook", "no bias", "tied"])
 def test_a_critic_that_the_user_has_changed_is_asked_itself(name):
     policy, model = changed(name), make("MlpPolicy").learn(1)
     with th.no_grad():
         expected = policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
     np.testing.assert_allclose(values_of(policy, model.rollout_buffer), expected, rtol=1e-5, atol=1e-6)
     assert (critic_layers(policy) is not None) == (name == "as it is")
+
+
+def test_a_hook_on_a_parameter_of_the_critic_is_called():
+    """Users mask gradients with them."""
+    model = make("MlpPolicy", n_critic_updates=3)
+    before = model.policy.value_net.weight.detach().clone()
+    model.policy.value_net.weight.register_hook(th.zeros_like)
+    model.learn(1)
+    assert th.equal(model.policy.value_net.weight, before)
 
 
 class Dropping(FlattenExtractor):
