@@ -8,9 +8,9 @@ and their medians printed. With rollouts of 2048 steps REINFORCE and A2C make on
     python examples/benchmarks/throughput.py --env CartPole-v1 --n-envs 1 8 64
 
 Where the time of a vector step of 8 CartPole-v1 environments goes, in rollouts of 2048 steps (microseconds on one core
-of a shared machine; the shares are what counts): environments 45 (their VecEnv's own ``step`` takes 60), actor and
-sampling 7, bookkeeping and storage 5 (and 4 with a callback), critic's values 2, returns and checks 2, policy step 10,
-critic's pass 6. Measured with a timer around each part. Of what is learning, half is matrix products.
+of a shared machine; the shares are what counts): environments 46 (their VecEnv's own ``step`` takes 54), actor and
+sampling 7, bookkeeping and storage 5 (and 4 with a callback), critic's values 3, returns and checks 1, policy step 11,
+critic's pass 5. Measured with a timer around each part. Of what is learning, more than half is matrix products.
 """
 
 import argparse

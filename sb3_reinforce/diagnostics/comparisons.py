@@ -58,8 +58,8 @@ def compare_baselines(
     have a smaller variance; a baseline that knows the time or the state can.
 
     What all names cost with an MlpPolicy and 100 episodes of CartPole-v1, in plain forward and backward passes over
-    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of 11 runs, one thread): 1.3 before
-    training, and 2.3 with collecting the episodes; for a trained policy, whose episodes last 500 steps, 1.9, and 8.6
+    each of these episodes (``examples/benchmarks/comparison_cost.py``; medians of 11 runs, one thread): 1.2 before
+    training, and 1.8 with collecting the episodes; for a trained policy, whose episodes last 500 steps, 1.9, and 8.9
     with collecting them, which is the environments' own time for the most part.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
