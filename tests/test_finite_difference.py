@@ -4,6 +4,7 @@ import os
 import threading
 import warnings
 from collections import deque
+from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CheckpointCallback,
@@ -22,6 +24,7 @@ from stable_baselines3.common.envs import FakeImageEnv, IdentityEnv, IdentityEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
@@ -290,6 +293,17 @@ def test_policies(policy: str, env: Any, deterministic: bool) -> None:
     model.learn(2)
     assert model._n_updates == 1 and model.theta.shape == (model.n_parameters,)
     assert np.isfinite(evaluate_policy(model, model.get_env(), 1)[0])
+
+
+def test_a_linear_policy_on_dicts() -> None:
+    """Where a features extractor puts them in a row."""
+    space = spaces.Dict(once=spaces.Box(-1, 1, (1,)), twice=spaces.Box(-2, 2, (1,)))
+    doubled = partial(TransformObservation, func=lambda s: {"once": s, "twice": 2 * s}, observation_space=space)
+    env = make_vec_env(lambda: doubled(Line()), 2)
+    model = make(env, policy_kwargs={"features_extractor_class": CombinedExtractor}).learn(20)
+    assert model.n_parameters == 2 and model._n_updates > 0
+    with pytest.raises(ValueError, match="use MultiInputPolicy"):
+        make(env)
 
 
 def test_frame_stack_over_normalize() -> None:
