@@ -1,14 +1,12 @@
 """FiniteDifference as an algorithm of Stable-Baselines3."""
 
-import sys
-import time
 import warnings
 from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -16,13 +14,11 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce import optimization, parameters
 from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_function
 from sb3_reinforce.candidate_actors import LoopActor, make_actor
-from sb3_reinforce.candidates import Step, evaluate
 from sb3_reinforce.common_settings import check_basics, check_learn
 from sb3_reinforce.environment_checks import check_env
 from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
@@ -34,19 +30,15 @@ from sb3_reinforce.persistence import Persistent
 from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation, new_generator
 from sb3_reinforce.prediction import predict
 from sb3_reinforce.search_settings import (
-    check_candidates,
     check_deltas,
     check_finite_difference,
     check_gradient,
     default_delta_std,
     default_n_delta,
 )
+from sb3_reinforce.utility import Stopped, Utility
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
-
-
-class Stopped(Exception):
-    """A callback returned False: ends an update from inside the estimator."""
 
 
 class FiniteDifference(Persistent):
@@ -105,6 +97,8 @@ class FiniteDifference(Persistent):
     }
     policy: ActorCriticPolicy
     predict = predict
+    # The keys of the on-policy algorithms, which ask nothing else of self
+    dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
 
     def __init__(
         self,
@@ -283,15 +277,14 @@ class FiniteDifference(Persistent):
         if self.n_top is not None:
             estimator = partial(central_difference, n_top=self.n_top)
 
-        self._candidates: list[th.Tensor] = []
-        self._utilities: list[th.Tensor] = []
-        utility = partial(self._utility, callback, int(th.randint(2**31, (), generator=generator)))
+        first_seed = int(th.randint(2**31, (), generator=generator))
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         try:
-            with frozen(self._vec_normalize_env) as self._observed:
+            with frozen(self._vec_normalize_env) as observed:
+                utility = self._utility = Utility(self, self._actor, callback, observed, first_seed)
                 gradient = check_gradient(estimator(utility, theta, deltas), len(theta))
-                if not self._utilities:
+                if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:
             # The environments are in the middle of episodes, and are reset before they are used again
@@ -299,52 +292,6 @@ class FiniteDifference(Persistent):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return gradient
-
-    def _utility(self, callback: BaseCallback, first_seed: int, candidates: th.Tensor) -> th.Tensor:
-        """
-        U of candidates: the mean return of ``n_eval_episodes`` episodes of each.
-
-        :param callback: Called at each step
-        :param first_seed: The seed of the update's first episode
-        :param candidates: Shape ``(k, n)``, or ``(m, k, n)`` where only candidates of one column are compared
-        :return: Shape ``(k,)`` or ``(m, k)``, float64
-        """
-        thetas = check_candidates(candidates, self.n_parameters).reshape(-1, self.n_parameters)
-        columns = np.arange(len(thetas)) % candidates.shape[1] if candidates.dim() == 3 else np.zeros(len(thetas), int)
-        episodes = np.arange(self.n_eval_episodes)
-        seeds = (first_seed + columns[:, None] * self.n_eval_episodes + episodes) % 2**31
-        returns = evaluate(
-            self._actor,
-            cast(VecEnv, self.env),
-            thetas,
-            seeds if self.common_random_numbers else None,
-            self.n_eval_episodes,
-            self.max_episode_steps,
-            partial(self._on_step, callback),
-            self._vec_normalize_env,
-        )
-        utilities = th.as_tensor(returns).mean(1)
-        self._candidates.append(thetas)
-        self._utilities.append(utilities)
-        return utilities.reshape(candidates.shape[:-1])
-
-    def _on_step(self, callback: BaseCallback, step: Step) -> None:
-        """Count a step of the environments and tell the callback; raise ``Stopped`` if it returns False."""
-        self.num_timesteps += len(step.dones)
-        if np.count_nonzero(step.finished):
-            finished = np.flatnonzero(step.finished)
-            self._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
-        callback.update_locals({"self": self, **vars(step)})
-        if self._observed is None:
-            go_on = callback.on_step()
-        else:
-            self._observed.update()
-            # A callback may save the wrapper, and must find it as the user has set it
-            self._observed.vec_normalize.training = True
-            go_on = callback.on_step()
-            self._observed.vec_normalize.training = False
-        if not go_on:
-            raise Stopped
 
     @uninterrupted
     def train(self, gradient: th.Tensor) -> None:
@@ -354,7 +301,7 @@ class FiniteDifference(Persistent):
         :param gradient: ĝ, shape ``(n,)``
         :raises ValueError: If the step is not finite; the parameters are those before it
         """
-        candidates, utilities = th.cat(self._candidates), th.cat(self._utilities)
+        candidates, utilities = th.cat(self._utility.candidates), th.cat(self._utility.values)
         fit = fit_quality(candidates - self.theta, utilities, gradient)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)
@@ -378,28 +325,8 @@ class FiniteDifference(Persistent):
         self.logger.record("rollout/utility_mean", float(utilities.mean()))
         self.logger.record("rollout/utility_std", utility_std)
 
-    def dump_logs(self, iteration: int = 0) -> None:
-        """
-        Write the log.
-
-        :param iteration: Updates of this run so far
-        """
-        time_elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
-        if iteration > 0:
-            self.logger.record("time/iterations", iteration, exclude="tensorboard")
-        if self.ep_info_buffer:
-            self.logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in self.ep_info_buffer]))
-        if self.ep_success_buffer:
-            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / time_elapsed))
-        self.logger.record("time/time_elapsed", int(time_elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(step=self.num_timesteps)
-
     def _excluded_save_params(self) -> list[str]:
-        mine = ["_actor_parameters", "_actor", "_candidates", "_utilities", "_observed"]
-        return [*super()._excluded_save_params(), *mine]
+        return [*super()._excluded_save_params(), "_actor_parameters", "_actor", "_utility"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

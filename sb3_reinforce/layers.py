@@ -17,6 +17,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 
+from sb3_reinforce.backpropagation import parameters_of
+
 # What a policy may have changed on the way from an observation to an action, or to V
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
 CRITIC_METHODS = ("forward", "extract_features", "predict_values")
@@ -118,8 +120,8 @@ def share_parameters(layers: list[th.nn.Module]) -> bool:
 
     :param layers: The layers of a plain MLP
     """
-    linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
-    return len({id(part) for layer in linear for part in (layer.weight, layer.bias)}) < 2 * len(linear)
+    parameters = parameters_of(layers)
+    return len(set(parameters)) < len(parameters)
 
 
 def is_changed(module: th.nn.Module) -> bool:

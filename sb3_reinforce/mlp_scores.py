@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.backpropagation import activations, deltas, divided
+from sb3_reinforce.backpropagation import activations, deltas, divided, parameters_of
 from sb3_reinforce.layers import actor_layers, overrides
 from sb3_reinforce.policies import Parameters, as_policy_actions
 from sb3_reinforce.rollouts import Rollout, select
@@ -97,12 +97,12 @@ def factors(
         log_std = [policy.log_std.detach().expand_as(outputs).requires_grad_()]
     log_prob = policy.action_dist.proba_distribution(divided(layers, outputs), *log_std).log_prob(actions)
     delta, *delta_std = th.autograd.grad(log_prob.sum(), [outputs, *log_std])
-    linear = [layer for layer in layers if isinstance(layer, th.nn.Linear)]
     found: dict[th.Tensor, Factors] = {}
+    weights, biases = parameters_of(layers)[::2], parameters_of(layers)[1::2]
     with th.no_grad():
-        shares = deltas(layers, [layer.weight for layer in linear], xs, delta)
-        for layer, (d, x) in zip(reversed(linear), shares, strict=True):
-            found[layer.weight], found[layer.bias] = (d, x), (d, None)
+        shares = deltas(layers, weights, xs, delta)
+        for weight, bias, (d, x) in zip(reversed(weights), reversed(biases), shares, strict=True):
+            found[weight], found[bias] = (d, x), (d, None)
     if delta_std:
         found[policy.log_std] = (delta_std[0], None)
     return [found[parameter] for parameter in parameters]

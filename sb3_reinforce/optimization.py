@@ -40,8 +40,8 @@ def step(
     scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
     optimizer.zero_grad()
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        if gradient is not None:
-            parameter.grad = as_parameter(gradient if scale == 1 else gradient * scale, parameter)
+        scaled = gradient if gradient is None or scale == 1 else gradient * scale
+        parameter.grad = None if scaled is None else as_parameter(scaled, parameter)
     optimizer.step()
     return norm
 

@@ -17,15 +17,9 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
-from torch.nn import functional as F
 
 from sb3_reinforce import optimization
-from sb3_reinforce.arguments import (
-    MAX_LEARNING_RATE,
-    CheckedSchedule,
-    check_flag,
-    check_function,
-)
+from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_flag, check_function
 from sb3_reinforce.baselines import BASELINES, Baseline
 from sb3_reinforce.collection import check_data, collect, warn_of_own_methods
 from sb3_reinforce.common_settings import check_basics, check_learn
@@ -37,11 +31,11 @@ from sb3_reinforce.persistence import Persistent
 from sb3_reinforce.policies import (
     MAX_TEMPERATURE,
     Parameters,
-    evaluate,
     floor_std,
     set_temperature,
     split_parameters,
 )
+from sb3_reinforce.policy_step import step_policy
 from sb3_reinforce.prediction import predict
 from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
 from sb3_reinforce.settings import check_reinforce
@@ -329,7 +323,8 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         """
         One policy step along ĝ, then the critic's passes.
 
-        :raises ValueError: If a gradient is not finite; the parameters are those before that step
+        :raises ValueError: If a gradient is not finite, or a step makes a parameter that is not; the parameters are
+            those before that step, or before the critic's passes
         """
         rollout = cast(Rollout, self._rollout)
         ent_coef, critic_rate = self._scheduled("ent_coef"), self._critic_rate()
@@ -338,23 +333,15 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
-        log_prob, entropy, values = evaluate(self.policy, steps.observations, steps.actions, with_values=bool(shared))
-        policy_loss = -(steps.weights * log_prob).sum() / self._denominator(rollout)
-        entropy_loss = -entropy.sum() / self._denominator(rollout)
-        loss = policy_loss + ent_coef * entropy_loss
-        if values is not None:
-            loss = loss + self.vf_coef * F.mse_loss(values, steps.returns)
-        gradient = th.autograd.grad(loss, actor, allow_unused=True)
-        with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
-            grad_norm = optimization.step(self.policy.optimizer, actor, gradient, self.max_grad_norm, "policy")
+        vf_coef = self.vf_coef if shared else None
+        log = step_policy(self.policy, actor, steps, self._denominator(rollout), ent_coef, vf_coef, self.max_grad_norm)
         # The temperature is that of the progress made, with which a saved model will be loaded
         self._apply_temperature_and_floor()
         self._n_updates += 1
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/entropy_loss", -entropy.mean().item())
-        self.logger.record("train/policy_loss", policy_loss.item())
-        self.logger.record("train/grad_norm", grad_norm)
+        for name, value in log.items():
+            self.logger.record(f"train/{name}", value)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if self.has_critic:

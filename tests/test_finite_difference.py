@@ -78,9 +78,9 @@ def test_the_gradient_is_the_estimator_applied_to_the_utility() -> None:
     model._setup_learn(1)
     model._prepare_search()
     gradient = model.estimate_gradient(Recorder_initialised(model))
-    starts = th.cat(model._candidates)
+    starts = th.cat(model._utility.candidates)
     # In Line with W = w, U = −(w s − 3 s)² = −(w − 3)² s² for the start s of the column
-    utilities = th.cat(model._utilities).reshape(2, 4)
+    utilities = th.cat(model._utility.values).reshape(2, 4)
     candidates = starts.reshape(2, 4)
     s_squared = -utilities / (candidates - 3) ** 2
     th.testing.assert_close(s_squared[0], s_squared[1], rtol=1e-4, atol=1e-6)
@@ -273,7 +273,7 @@ def test_utilities_are_sums_of_rewards_before_their_scaling() -> None:
     env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_reward=True)
     env.ret_rms.var = np.array(100.0)
     model = make(env, n_delta=2).learn(1)
-    lengths = [float(utility) for utility in th.cat(model._utilities)]
+    lengths = [float(utility) for utility in th.cat(model._utility.values)]
     assert all(length.is_integer() and length > 1 for length in lengths)
     assert sorted(lengths) == sorted(episode["l"] for episode in model.ep_info_buffer)
 

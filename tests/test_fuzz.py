@@ -165,7 +165,7 @@ def assert_trains(algorithm, env, arguments):
     elif algorithm is REINFORCE:
         assert len(model.ep_info_buffer) == min(model._n_updates * model.n_episodes, 100)
     else:
-        used = len(model._candidates) and model._n_updates * len(np.concatenate(model._candidates))
+        used = model._n_updates * len(np.concatenate(model._utility.candidates))
         assert len(model.ep_info_buffer) == min(used * model.n_eval_episodes, 100) <= n_episodes
 
 
