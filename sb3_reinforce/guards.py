@@ -67,11 +67,10 @@ def watched(env: VecEnv | None) -> Iterator[None]:
             # What another wrapper has made of finite numbers may not be finite, but what VecNormalize has, is
             is_checked = isinstance(wrapper.venv, VecNormalize)
             if isinstance(wrapper, VecNormalize) and isinstance(wrapper.venv, VecEnvWrapper) and not is_checked:
-                own, cls = vars(wrapper.venv), type(wrapper.venv)
+                own = vars(wrapper.venv)
                 for name, check in {"step_wait": checked_step, "reset": checked_reset}.items():
                     if name not in own:
-                        # In this form a copy of the environments calls its own
-                        own[name] = partial(check, partial(getattr(cls, name), wrapper.venv))
+                        own[name] = partial(check, getattr(wrapper.venv, name))
                         stack.callback(own.pop, name, None)
         if wrappers and not isinstance(env, Guard):
             guard = Guard(cast(VecEnv, env), any(isinstance(wrapper, VecNormalize) for wrapper in wrappers))

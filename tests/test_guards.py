@@ -7,6 +7,7 @@ import threading
 import time
 from copy import deepcopy
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch as th
@@ -511,6 +512,37 @@ def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
     assert model.num_timesteps >= 40 and type(env.venv) is DummyVecEnv
     VecNormalize.load(tmp_path / "statistics", of_two())
     assert KINDS[kind][0].load(tmp_path / "model", env=of_two(), device="cpu").learn(16).num_timesteps >= 16
+
+
+class Copyable(VecEnvWrapper):
+    """As VecNormalize, without what cannot be copied of a wrapper."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+    def __getstate__(self):
+        return {key: value for key, value in vars(self).items() if key != "class_attributes"}
+
+    def __setstate__(self, state):
+        vars(self).update(state)
+
+
+@all_kinds
+@pytest.mark.parametrize("copied", [deepcopy, lambda env: cloudpickle.loads(cloudpickle.dumps(env))])
+def test_a_copy_of_a_wrapper_below_vec_normalize_leads_a_life_of_its_own(copied, kind):
+    env = VecNormalize(Copyable(DummyVecEnv([lambda: Monitor(Faulty())] * 2)))
+
+    def act(model):
+        before = env.get_attr("n_steps")
+        copy = copied(env.venv)
+        copy.reset()
+        copy.step(np.zeros(2, int))
+        assert copy.unwrapped.get_attr("n_steps") == [before[0] + 1] * 2 and env.get_attr("n_steps") == before
+
+    assert make(kind, env).learn(40, callback=Once(act)).num_timesteps >= 40
 
 
 @all_kinds
