@@ -1,6 +1,7 @@
-"""One torch thread per test process, since the tests run in parallel; and the same random numbers in every run."""
+"""One torch thread per test process, as tests run in parallel; the same random numbers and signals in every run."""
 
 import itertools
+import signal
 
 import pytest
 import torch as th
@@ -16,3 +17,11 @@ def same_random_numbers(monkeypatch):
     set_random_seed(0)
     seeds, np_random = itertools.count(), seeding.np_random
     monkeypatch.setattr(seeding, "np_random", lambda seed=None: np_random(next(seeds) if seed is None else seed))
+
+
+@pytest.fixture(autouse=True)
+def as_in_a_terminal():
+    """A shell that runs the tests in the background lets them ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

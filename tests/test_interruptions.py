@@ -16,14 +16,6 @@ from sb3_reinforce import REINFORCE
 all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
-@pytest.fixture(autouse=True)
-def as_in_a_terminal():
-    """A shell that runs the tests in the background lets them ignore SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 class At(BaseCallback):
     """Does something at one step."""
 
