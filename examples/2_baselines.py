@@ -14,8 +14,8 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baselines import BASELINES, none
-from sb3_reinforce.scores import episode_gradients
+from sb3_reinforce.estimation.baselines import BASELINES, none
+from sb3_reinforce.estimation.scores import episode_gradients
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)

@@ -16,27 +16,28 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import optimization, parameters
-from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_function
-from sb3_reinforce.candidate_actors import LoopActor, make_actor
-from sb3_reinforce.common_settings import check_basics, check_learn
-from sb3_reinforce.environment_checks import check_env
-from sb3_reinforce.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
-from sb3_reinforce.guards import guarded
-from sb3_reinforce.interruptions import uninterrupted
-from sb3_reinforce.linear_policy import LinearPolicy
-from sb3_reinforce.normalization import frozen
-from sb3_reinforce.persistence import Persistent
-from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation, new_generator
-from sb3_reinforce.prediction import predict
-from sb3_reinforce.search_settings import (
+from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_function
+from sb3_reinforce.common.base import Persistent
+from sb3_reinforce.common.common_settings import check_basics, check_learn
+from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.prediction import predict
+from sb3_reinforce.common.search_settings import (
     check_deltas,
     check_finite_difference,
     check_gradient,
     default_delta_std,
     default_n_delta,
 )
-from sb3_reinforce.utility import Stopped, Utility
+from sb3_reinforce.envs.checks import check_env
+from sb3_reinforce.envs.guards import guarded
+from sb3_reinforce.estimation.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, new_generator
+from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.linear import LinearPolicy
+from sb3_reinforce.sampling.candidate_actors import LoopActor, make_actor
+from sb3_reinforce.sampling.normalization import frozen
+from sb3_reinforce.sampling.utility import Stopped, Utility
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 

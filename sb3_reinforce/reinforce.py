@@ -18,28 +18,28 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import optimization
-from sb3_reinforce.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_flag, check_function
-from sb3_reinforce.baselines import BASELINES, Baseline
-from sb3_reinforce.collection import check_data, collect, warn_of_own_methods
-from sb3_reinforce.common_settings import check_basics, check_learn
-from sb3_reinforce.critic import fit_critic
-from sb3_reinforce.environment_checks import check_env
-from sb3_reinforce.guards import guarded
-from sb3_reinforce.interruptions import uninterrupted
-from sb3_reinforce.persistence import Persistent
-from sb3_reinforce.policies import (
+from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_flag, check_function
+from sb3_reinforce.common.base import Persistent
+from sb3_reinforce.common.common_settings import check_basics, check_learn
+from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.prediction import predict
+from sb3_reinforce.common.settings import check_reinforce
+from sb3_reinforce.envs.checks import check_env
+from sb3_reinforce.envs.guards import guarded
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline
+from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode
+from sb3_reinforce.estimation.weights import Running, Steps, Weighing, used_steps, weigh
+from sb3_reinforce.policies.critic import fit_critic
+from sb3_reinforce.policies.evaluation import (
     MAX_TEMPERATURE,
     Parameters,
     floor_std,
     set_temperature,
     split_parameters,
 )
-from sb3_reinforce.policy_step import step_policy
-from sb3_reinforce.prediction import predict
-from sb3_reinforce.rollouts import Extent, Rollout, in_finished_episode
-from sb3_reinforce.settings import check_reinforce
-from sb3_reinforce.weighing import Running, Steps, Weighing, used_steps, weigh
+from sb3_reinforce.policies.policy_step import step_policy
+from sb3_reinforce.sampling.collection import check_data, collect, warn_of_own_methods
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 

@@ -12,8 +12,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.actors import GeneralActor, LaidOutActor, make_actor, make_noise, make_sampler
-from sb3_reinforce.layers import actor_layers
+from sb3_reinforce.policies.plain_mlp import actor_layers
+from sb3_reinforce.sampling.actors import GeneralActor, LaidOutActor, make_actor, make_noise, make_sampler
 
 SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
 N_DRAWS = 4000
@@ -35,7 +35,7 @@ def test_without_noise_it_is_the_mode(space, activation_fn, monkeypatch):
     policy = make_policy(space, policy_kwargs={"activation_fn": activation_fn})
     obs = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
     zeros = iter([np.zeros((50, policy.action_net.out_features), dtype=np.float32)])
-    monkeypatch.setattr("sb3_reinforce.actors.make_noise", lambda *args: zeros)
+    monkeypatch.setattr("sb3_reinforce.sampling.actors.make_noise", lambda *args: zeros)
     actions, _, _ = LaidOutActor(policy, actor_layers(policy), 50).act(obs)
     with th.no_grad():
         mode = policy.get_distribution(obs_as_tensor(obs, "cpu")).mode().numpy()

@@ -5,9 +5,9 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_reinforce.backpropagation import squared_error, tanh, through
-from sb3_reinforce.layers import DivideLogits
-from sb3_reinforce.optimization import step
+from sb3_reinforce.common.optimization import step
+from sb3_reinforce.policies.backpropagation import squared_error, tanh, through
+from sb3_reinforce.policies.plain_mlp import DivideLogits
 
 MLPS = {
     "tanh": lambda: [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 5), nn.Tanh(), nn.Linear(5, 2)],

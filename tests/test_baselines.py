@@ -4,8 +4,8 @@ import pytest
 import torch as th
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baselines import BASELINES, leave_one_out, mean, none, time_mean
-from sb3_reinforce.rollouts import Rollout
+from sb3_reinforce.estimation.baselines import BASELINES, leave_one_out, mean, none, time_mean
+from sb3_reinforce.estimation.rollout import Rollout
 
 
 def make_rollout(returns, dones, timesteps, used=None, policy=None):

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-from sb3_reinforce.vec_env import GymnasiumVecEnv
+from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 all_kinds = pytest.mark.parametrize("kind", KINDS)
 

@@ -16,10 +16,10 @@ from stable_baselines3.common.policies import (
 )
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_reinforce import parameters
-from sb3_reinforce.candidate_actors import LoopActor, MatrixActor, VmapActor, actor_class, make_actor, mode
-from sb3_reinforce.candidates import Step, evaluate, queues, start
-from sb3_reinforce.linear_policy import LinearPolicy
+from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.linear import LinearPolicy
+from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, VmapActor, actor_class, make_actor, mode
+from sb3_reinforce.sampling.candidates import Step, evaluate, queues, start
 
 BOX = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)

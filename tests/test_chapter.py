@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies import log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 
 
 class OneStep(gym.Env):

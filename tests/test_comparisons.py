@@ -13,7 +13,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baselines import BASELINES
 from sb3_reinforce.diagnostics import (
     GradientQualityCallback,
     baseline_gradients,
@@ -24,7 +23,8 @@ from sb3_reinforce.diagnostics import (
     sample,
 )
 from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals, gradient_blocks
-from sb3_reinforce.scores import episode_gradients
+from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation.scores import episode_gradients
 
 BOX = spaces.Box(-1, 1, (1,))
 

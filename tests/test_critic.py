@@ -10,9 +10,9 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.critic import fit_critic, values_of
-from sb3_reinforce.layers import critic_layers
-from sb3_reinforce.policies import evaluate
+from sb3_reinforce.policies.critic import fit_critic, values_of
+from sb3_reinforce.policies.evaluation import evaluate
+from sb3_reinforce.policies.plain_mlp import critic_layers
 
 N_STEPS, N_ENVS = 7, 3
 

@@ -283,7 +283,7 @@ def test_an_exception_of_the_environment_passes_and_leaves_the_last_parameters(t
 
 
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
-    from sb3_reinforce.policies import floor_std, set_temperature
+    from sb3_reinforce.policies.evaluation import floor_std, set_temperature
 
     with pytest.raises(ValueError, match="action_net"):
         set_temperature(th.nn.Linear(1, 1), 0.5)

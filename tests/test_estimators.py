@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_reinforce.estimators import (
+from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
     Utility,
     central_difference,
@@ -12,7 +12,7 @@ from sb3_reinforce.estimators import (
     forward_difference,
     regression_gradient,
 )
-from sb3_reinforce.perturbations import gaussian
+from sb3_reinforce.estimation.perturbations import gaussian
 
 N = 5
 SEEDS = pytest.mark.parametrize("seed", range(20))

@@ -28,7 +28,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimators import central_difference
+from sb3_reinforce.estimation.estimators import central_difference
 
 LINEAR = ("LinearPolicy", "CartPole-v1")
 SMALL: dict[str, Any] = dict(n_delta=3, estimator="central", seed=0, device="cpu")

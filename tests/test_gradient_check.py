@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import NatureCNN
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
 from sb3_reinforce.diagnostics.rollout_errors import return_by_definition
-from sb3_reinforce.returns import lambda_return
+from sb3_reinforce.estimation.returns import lambda_return
 
 ACTION_SPACES = [
     spaces.Discrete(3),

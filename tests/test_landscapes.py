@@ -56,10 +56,10 @@ def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
 
 
 def test_pictures_without_matplotlib_say_what_to_install(monkeypatch):
-    monkeypatch.delitem(sys.modules, "sb3_reinforce.plots", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_reinforce.diagnostics.plots", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'sb3-reinforce\[plots\]'"):
-        importlib.import_module("sb3_reinforce.plots")
+        importlib.import_module("sb3_reinforce.diagnostics.plots")
 
 
 @pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])
@@ -180,7 +180,7 @@ def test_a_wrong_plane_is_named_before_it_is_evaluated(kwargs, message):
         landscape(model, **kwargs)
 
 
-plots = pytest.importorskip("matplotlib") and pytest.importorskip("sb3_reinforce.plots")
+plots = pytest.importorskip("matplotlib") and pytest.importorskip("sb3_reinforce.diagnostics.plots")
 
 
 def save(ax, path):

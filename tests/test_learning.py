@@ -9,7 +9,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.vec_env import GymnasiumVecEnv
+from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 
 @pytest.mark.parametrize("baseline", ["none", "time_mean", "leave_one_out", "value"])

@@ -7,8 +7,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 
-from sb3_reinforce import REINFORCE, FiniteDifference, parameters
-from sb3_reinforce.linear_policy import LinearPolicy
+from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.linear import LinearPolicy
 
 OBS, ACTIONS = spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,))
 

@@ -5,8 +5,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_reinforce import passes
-from sb3_reinforce.passes import lay_out
+from sb3_reinforce.policies import passes
+from sb3_reinforce.policies.passes import lay_out
 
 MLPS = {
     "tanh": [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 4), nn.Tanh(), nn.Linear(4, 2)],

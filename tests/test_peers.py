@@ -18,7 +18,7 @@ from environments import Corridor
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.weighing import normalized
+from sb3_reinforce.estimation.weights import normalized
 
 
 def test_normalized_weights_are_divided_by_their_deviation_not_its_square():

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_reinforce.perturbations import PERTURBATIONS, coordinate, rademacher, sphere
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, coordinate, rademacher, sphere
 
 
 def generator(seed: int = 0) -> th.Generator:

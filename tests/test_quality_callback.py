@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger, configure
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import GradientQualityCallback
 from sb3_reinforce.diagnostics.quality_callback import evenly_spread
-from sb3_reinforce.scores import episode_gradients
+from sb3_reinforce.estimation.scores import episode_gradients
 
 
 class Recorded(Logger):

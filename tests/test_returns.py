@@ -6,8 +6,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_reinforce.returns import discounted_sum, generalized_advantage, lambda_return, reward_to_go, total_return
-from sb3_reinforce.rollouts import timesteps_of
+from sb3_reinforce.estimation.returns import (
+    discounted_sum,
+    generalized_advantage,
+    lambda_return,
+    reward_to_go,
+    total_return,
+)
+from sb3_reinforce.estimation.rollout import timesteps_of
 
 N_STEPS, N_ENVS = 37, 3
 

@@ -11,8 +11,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baselines import BASELINES
-from sb3_reinforce.rollouts import Extent
+from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation.rollout import Extent
 
 CUTS = "ignore:Episodes that n_steps cuts"
 

@@ -11,8 +11,9 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_reinforce import REINFORCE, scores
-from sb3_reinforce.scores import PIECE, episode_gradients, gradients_by_episode
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.estimation import scores
+from sb3_reinforce.estimation.scores import PIECE, episode_gradients, gradients_by_episode
 
 ACTION_SPACES = [
     spaces.Discrete(3),

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_reinforce.stepping import step_in_turn, stepper
+from sb3_reinforce.envs.stepping import step_in_turn, stepper
 
 SPACES = {
     "box": spaces.Box(-1, 1, (2, 3)),

@@ -21,7 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
-from sb3_reinforce import storage
+from sb3_reinforce.common import storage
 
 both = pytest.mark.parametrize("kind", ["steps", "search"])
 

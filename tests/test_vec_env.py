@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.vec_env import GymnasiumVecEnv
+from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 N_ENVS = 3
 

@@ -19,7 +19,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import sample
 from sb3_reinforce.diagnostics.bootstrap import resamples
 from sb3_reinforce.diagnostics.comparisons import baseline_rows, compare_baselines, functions_of
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import as_policy_actions, log_prob_and_entropy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)

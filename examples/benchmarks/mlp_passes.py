@@ -15,7 +15,7 @@ from collections.abc import Callable
 import torch as th
 from torch.nn import functional as F
 
-from sb3_reinforce.backpropagation import squared_error
+from sb3_reinforce.policies.backpropagation import squared_error
 
 
 def seconds(function: Callable[[], object]) -> float:

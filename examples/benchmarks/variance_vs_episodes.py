@@ -18,9 +18,9 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.baselines import BASELINES
 from sb3_reinforce.diagnostics import gradients_by_episode, sample
-from sb3_reinforce.plots import plot_variances
+from sb3_reinforce.diagnostics.plots import plot_variances
+from sb3_reinforce.estimation.baselines import BASELINES
 
 SIZES, N_GROUPS = (4, 8, 16, 32), 8
 

@@ -14,7 +14,7 @@ from sb3_reinforce.diagnostics.pitfall_callback import PitfallCallback
 from sb3_reinforce.diagnostics.quality_callback import GradientQualityCallback
 from sb3_reinforce.diagnostics.sampling import sample
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.scores import gradients_by_episode
+from sb3_reinforce.estimation.scores import gradients_by_episode
 
 __all__ = [
     "BaselineRow",

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import torch as th
 
-from sb3_reinforce.baselines import ratio_of_others
 from sb3_reinforce.diagnostics.moments import gram
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import CHUNK, gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.baselines import ratio_of_others
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, scored_parameters
 
 
 def grams(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:

@@ -7,16 +7,16 @@ from typing import cast
 
 import torch as th
 
-from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.baselines import BASELINES, Baseline
+from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
 from sb3_reinforce.diagnostics.baseline_gradients import grams
 from sb3_reinforce.diagnostics.bootstrap import UNKNOWN, Estimate, interval, resamples
 from sb3_reinforce.diagnostics.moments import moments, signal_to_noise, variance
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, sample, seeded
 from sb3_reinforce.diagnostics.tables import Table
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.weighing import check_baseline
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import torch as th
 
-from sb3_reinforce.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.common.search_settings import default_delta_std, default_n_delta
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
 from sb3_reinforce.diagnostics.moments import cosine, gram, moments, signal_to_noise
 from sb3_reinforce.diagnostics.sampling import check_independent, seeded
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.estimators import ESTIMATORS
+from sb3_reinforce.estimation.estimators import ESTIMATORS
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.perturbations import PERTURBATIONS, Perturbation
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.search_settings import default_delta_std, default_n_delta
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
 

@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 
-from sb3_reinforce.arguments import check_integer
+from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error, some
 from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
 from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.policies import as_policy_actions
+from sb3_reinforce.estimation.rollout import select
+from sb3_reinforce.estimation.scores import scored_parameters
+from sb3_reinforce.policies.evaluation import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import select
-from sb3_reinforce.scores import scored_parameters
 
 
 @dataclass(frozen=True)

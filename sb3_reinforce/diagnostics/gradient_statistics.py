@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch as th
 
-from sb3_reinforce.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.moments import Moments, cosine, gram, moments, noise_scale, signal_to_noise, variance
 

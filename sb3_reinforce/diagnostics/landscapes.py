@@ -11,11 +11,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import parameters
-from sb3_reinforce.arguments import check_integer, check_number
-from sb3_reinforce.candidate_actors import make_actor
-from sb3_reinforce.candidates import Step, evaluate
+from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.sampling import check_env, seeded, undisturbed
+from sb3_reinforce.policies import parameters
+from sb3_reinforce.sampling.candidate_actors import make_actor
+from sb3_reinforce.sampling.candidates import Step, evaluate
 
 
 class CandidateUtility:

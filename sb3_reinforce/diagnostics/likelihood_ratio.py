@@ -8,13 +8,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce import baselines
 from sb3_reinforce.diagnostics.sampling import sampled
+from sb3_reinforce.estimation import baselines
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.parameters import actor_parameters
+from sb3_reinforce.policies.parameters import actor_parameters
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 
 
 def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:

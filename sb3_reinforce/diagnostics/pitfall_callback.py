@@ -12,10 +12,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.updates import Seen, Update
-from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.estimation.rollout import Rollout, TensorOrDict, select, take
+from sb3_reinforce.estimation.scores import flat, scored_parameters
+from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout, TensorOrDict, select, take
-from sb3_reinforce.scores import flat, scored_parameters
 
 
 class PitfallCallback(BaseCallback):

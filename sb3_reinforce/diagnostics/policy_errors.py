@@ -7,10 +7,10 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.optimization import in_a_row
-from sb3_reinforce.policies import Parameters, as_policy_actions, log_prob_and_entropy
-from sb3_reinforce.rollouts import take
-from sb3_reinforce.scores import flat, score_parameters
+from sb3_reinforce.common.optimization import in_a_row
+from sb3_reinforce.estimation.rollout import take
+from sb3_reinforce.estimation.scores import flat, score_parameters
+from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions, log_prob_and_entropy
 
 # Draws behind a frequency or a mean action, and for observations of more elements than LARGE
 N_DRAWS, N_DRAWS_LARGE, LARGE = 1024, 256, 4096

@@ -7,19 +7,19 @@ from typing import Any, cast
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_reinforce.arguments import check_integer
-from sb3_reinforce.baselines import Baseline
+from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.optimization import in_a_row
 from sb3_reinforce.diagnostics.baseline_gradients import gradient_blocks
 from sb3_reinforce.diagnostics.comparisons import functions_of
 from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
+from sb3_reinforce.estimation.baselines import Baseline
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import scored_parameters
+from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.optimization import in_a_row
-from sb3_reinforce.policies import Parameters
+from sb3_reinforce.policies.evaluation import Parameters
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import scored_parameters
-from sb3_reinforce.weighing import check_baseline
 
 
 class GradientQualityCallback(BaseCallback):

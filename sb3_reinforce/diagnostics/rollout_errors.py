@@ -4,13 +4,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
-from sb3_reinforce.critic import stack
+from sb3_reinforce.common.optimization import in_a_row
 from sb3_reinforce.diagnostics.policy_errors import relative
 from sb3_reinforce.diagnostics.sampling import Infos, training_weights
-from sb3_reinforce.optimization import in_a_row
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.policies.critic import stack
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import gradients_by_episode, scored_parameters
 
 
 def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: float, lam: float) -> np.ndarray:

@@ -14,11 +14,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.arguments import check_integer
-from sb3_reinforce.baselines import Baseline
-from sb3_reinforce.collection import by_step
+from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.estimation.baselines import Baseline
+from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.rollouts import Rollout
+from sb3_reinforce.sampling.collection import by_step
 
 AnyREINFORCE = TypeVar("AnyREINFORCE", bound=REINFORCE)
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_number
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "finite_difference": FiniteDifference}
 HYPERPARAMS = Path(__file__).parent / "hyperparams"

@@ -12,10 +12,10 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.backpropagation import activations, deltas, divided, parameters_of
-from sb3_reinforce.layers import actor_layers, overrides
-from sb3_reinforce.policies import Parameters, as_policy_actions
-from sb3_reinforce.rollouts import Rollout, select
+from sb3_reinforce.estimation.rollout import Rollout, select
+from sb3_reinforce.policies.backpropagation import activations, deltas, divided, parameters_of
+from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions
+from sb3_reinforce.policies.plain_mlp import actor_layers, overrides
 
 # Steps that share a forward and a backward pass: what they leave behind is to stay in the cache
 STEPS = 4096

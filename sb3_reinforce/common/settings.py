@@ -6,7 +6,7 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_reinforce.arguments import (
+from sb3_reinforce.common.arguments import (
     as_integers,
     check_choice,
     check_flag,
@@ -14,8 +14,8 @@ from sb3_reinforce.arguments import (
     check_kind,
     check_number,
 )
-from sb3_reinforce.baselines import BASELINES
-from sb3_reinforce.common_settings import check_basics_of
+from sb3_reinforce.common.common_settings import check_basics_of
+from sb3_reinforce.estimation.baselines import BASELINES
 
 DEFAULT_N_STEPS = 32
 DEFAULT_N_EPISODES = 16

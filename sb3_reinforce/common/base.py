@@ -13,9 +13,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
-from sb3_reinforce.arguments import check_flag
-from sb3_reinforce.environment_checks import check_env
-from sb3_reinforce.storage import Place, check_archive, whole_or_not_at_all
+from sb3_reinforce.common.arguments import check_flag
+from sb3_reinforce.common.storage import Place, check_archive, whole_or_not_at_all
+from sb3_reinforce.envs.checks import check_env
 
 Model = TypeVar("Model", bound="Persistent")
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_reinforce.environment_checks import BadData, check_observation, has_form
+from sb3_reinforce.envs.checks import BadData, check_observation, has_form
 
 
 def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -> None:

@@ -13,8 +13,8 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.backpropagation import through
-from sb3_reinforce.layers import DivideLogits, actor_layers, overrides
+from sb3_reinforce.policies.backpropagation import through
+from sb3_reinforce.policies.plain_mlp import DivideLogits, actor_layers, overrides
 
 Parameters: TypeAlias = list[th.nn.Parameter]
 

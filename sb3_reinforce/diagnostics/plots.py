@@ -16,13 +16,15 @@ try:
     from matplotlib.axes import Axes
     from matplotlib.ticker import NullLocator
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError("sb3_reinforce.plots needs matplotlib: pip install 'sb3-reinforce[plots]'") from error
+    raise ModuleNotFoundError(
+        "sb3_reinforce.diagnostics.plots needs matplotlib: pip install 'sb3-reinforce[plots]'"
+    ) from error
 
-from sb3_reinforce.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.comparisons import BaselineRow
 from sb3_reinforce.diagnostics.landscapes import Landscape
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.returns import Floats
+from sb3_reinforce.estimation.returns import Floats
 
 # Colours that readers with any colour vision tell apart (Okabe and Ito, 2008)
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")

@@ -21,10 +21,15 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.layers import actor_layers
-from sb3_reinforce.passes import Floats, lay_out
-from sb3_reinforce.policies import as_policy_actions, distribution_of, log_prob_and_entropy, tells_values
-from sb3_reinforce.rollouts import flatten
+from sb3_reinforce.estimation.rollout import flatten
+from sb3_reinforce.policies.evaluation import (
+    as_policy_actions,
+    distribution_of,
+    log_prob_and_entropy,
+    tells_values,
+)
+from sb3_reinforce.policies.passes import Floats, lay_out
+from sb3_reinforce.policies.plain_mlp import actor_layers
 
 # Actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]

@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.returns import Bools, Integers
+from sb3_reinforce.estimation.returns import Bools, Integers
 
 TensorOrDict = TypeVar("TensorOrDict", th.Tensor, PyTorchObs)
 

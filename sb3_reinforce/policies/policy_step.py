@@ -4,9 +4,9 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn import functional as F
 
-from sb3_reinforce import optimization
-from sb3_reinforce.policies import Parameters, evaluate
-from sb3_reinforce.weighing import Steps
+from sb3_reinforce.common import optimization
+from sb3_reinforce.estimation.weights import Steps
+from sb3_reinforce.policies.evaluation import Parameters, evaluate
 
 
 def step_policy(

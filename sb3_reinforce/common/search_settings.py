@@ -5,10 +5,10 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.arguments import as_integers, check_flag, check_function, check_number
-from sb3_reinforce.common_settings import check_basics_of
-from sb3_reinforce.estimators import ESTIMATORS
-from sb3_reinforce.perturbations import PERTURBATIONS
+from sb3_reinforce.common.arguments import as_integers, check_flag, check_function, check_number
+from sb3_reinforce.common.common_settings import check_basics_of
+from sb3_reinforce.estimation.estimators import ESTIMATORS
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS
 
 # Beyond this many perturbations the rule of thumb costs more than a rough gradient and more updates do
 MAX_DEFAULT_N_DELTA = 64

@@ -13,13 +13,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
 
-from sb3_reinforce import optimization
-from sb3_reinforce.backpropagation import activations, squared_error
-from sb3_reinforce.collection import Ends
-from sb3_reinforce.layers import critic_layers, overrides
-from sb3_reinforce.policies import Parameters, tells_values
-from sb3_reinforce.returns import Floats
-from sb3_reinforce.rollouts import flatten, take
+from sb3_reinforce.common import optimization
+from sb3_reinforce.estimation.returns import Floats
+from sb3_reinforce.estimation.rollout import flatten, take
+from sb3_reinforce.policies.backpropagation import activations, squared_error
+from sb3_reinforce.policies.evaluation import Parameters, tells_values
+from sb3_reinforce.policies.plain_mlp import critic_layers, overrides
+from sb3_reinforce.sampling.collection import Ends
 
 
 @th.no_grad()

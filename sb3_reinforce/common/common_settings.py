@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 
-from sb3_reinforce.arguments import as_integers, check_flag, check_integer, check_kind, check_number
+from sb3_reinforce.common.arguments import as_integers, check_flag, check_integer, check_kind, check_number
 
 # What NumPy takes
 MAX_SEED = 2**32 - 1

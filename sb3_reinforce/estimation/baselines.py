@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 import torch as th
 
-from sb3_reinforce.rollouts import Rollout
-from sb3_reinforce.scores import CHUNK, gradients_by_episode
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode
 
 Baseline: TypeAlias = Callable[[Rollout], th.Tensor]
 

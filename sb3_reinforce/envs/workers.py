@@ -14,8 +14,8 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_reinforce.environment_checks import as_reward, check_observation
-from sb3_reinforce.interruptions import uninterrupted
+from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.envs.checks import as_reward, check_observation
 
 
 class Watched:

@@ -18,9 +18,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_reinforce.candidate_actors import MatrixActor
-from sb3_reinforce.environment_checks import all_finite, is_finite, told
-from sb3_reinforce.stepping import stepper
+from sb3_reinforce.envs.checks import all_finite, is_finite, told
+from sb3_reinforce.envs.stepping import stepper
+from sb3_reinforce.sampling.candidate_actors import MatrixActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 

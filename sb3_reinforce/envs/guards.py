@@ -10,10 +10,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.environment_checks import BadData, check_finite, save_obs
-from sb3_reinforce.interruptions import interruptible
-from sb3_reinforce.stepping import stepper
-from sb3_reinforce.workers import watch
+from sb3_reinforce.common.interruptions import interruptible
+from sb3_reinforce.envs.checks import BadData, check_finite, save_obs
+from sb3_reinforce.envs.stepping import stepper
+from sb3_reinforce.envs.workers import watch
 
 Model = TypeVar("Model", bound=BaseAlgorithm)
 Arguments = ParamSpec("Arguments")

@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 
-from sb3_reinforce.backpropagation import parameters_of
+from sb3_reinforce.policies.backpropagation import parameters_of
 
 # What a policy may have changed on the way from an observation to an action, or to V
 ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")

@@ -6,10 +6,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_reinforce.candidate_actors import MatrixActor
-from sb3_reinforce.candidates import Step, evaluate
-from sb3_reinforce.normalization import Observed
-from sb3_reinforce.search_settings import check_candidates
+from sb3_reinforce.common.search_settings import check_candidates
+from sb3_reinforce.sampling.candidate_actors import MatrixActor
+from sb3_reinforce.sampling.candidates import Step, evaluate
+from sb3_reinforce.sampling.normalization import Observed
 
 
 class Stopped(Exception):

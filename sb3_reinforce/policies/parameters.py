@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.policies import as_policy_actions, log_prob_and_entropy, reached
+from sb3_reinforce.policies.evaluation import as_policy_actions, log_prob_and_entropy, reached
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:

@@ -15,9 +15,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.batches import check_batch, copy, info_of, one_of
-from sb3_reinforce.environment_checks import check_observation
-from sb3_reinforce.returns import Bools
+from sb3_reinforce.envs.batches import check_batch, copy, info_of, one_of
+from sb3_reinforce.envs.checks import check_observation
+from sb3_reinforce.estimation.returns import Bools
 
 Restart: TypeAlias = Callable[[Any, Bools], Any]
 

@@ -17,11 +17,11 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.actors import make_actor
-from sb3_reinforce.environment_checks import check_finite
-from sb3_reinforce.returns import Bools
-from sb3_reinforce.rollouts import Extent
-from sb3_reinforce.stepping import stepper
+from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.envs.stepping import stepper
+from sb3_reinforce.estimation.returns import Bools
+from sb3_reinforce.estimation.rollout import Extent
+from sb3_reinforce.sampling.actors import make_actor
 
 # The arrays of a RolloutBuffer that have one row per step
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
