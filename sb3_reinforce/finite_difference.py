@@ -29,7 +29,7 @@ from sb3_reinforce.common.search_settings import (
     default_delta_std,
     default_n_delta,
 )
-from sb3_reinforce.envs.checks import check_env
+from sb3_reinforce.common.spaces import check_env
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, new_generator

@@ -25,19 +25,13 @@ from sb3_reinforce.common.common_settings import check_basics, check_learn
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.prediction import predict
 from sb3_reinforce.common.settings import check_reinforce
-from sb3_reinforce.envs.checks import check_env
+from sb3_reinforce.common.spaces import check_env
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode
 from sb3_reinforce.estimation.weights import Running, Steps, Weighing, used_steps, weigh
 from sb3_reinforce.policies.critic import fit_critic
-from sb3_reinforce.policies.evaluation import (
-    MAX_TEMPERATURE,
-    Parameters,
-    floor_std,
-    set_temperature,
-    split_parameters,
-)
+from sb3_reinforce.policies.evaluation import MAX_TEMPERATURE, Parameters, floor_std, set_temperature, split_parameters
 from sb3_reinforce.policies.policy_step import step_policy
 from sb3_reinforce.sampling.collection import check_data, collect, warn_of_own_methods
 

@@ -16,10 +16,11 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.diagnostics import sample
 from sb3_reinforce.diagnostics.bootstrap import resamples
 from sb3_reinforce.diagnostics.comparisons import baseline_rows, compare_baselines, functions_of
-from sb3_reinforce.policies.evaluation import as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)

@@ -14,8 +14,8 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common.arguments import check_flag
+from sb3_reinforce.common.spaces import check_env
 from sb3_reinforce.common.storage import Place, check_archive, whole_or_not_at_all
-from sb3_reinforce.envs.checks import check_env
 
 Model = TypeVar("Model", bound="Persistent")
 

@@ -3,7 +3,7 @@
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_reinforce.sampling.collection import shift_to_start
+from sb3_reinforce.common.spaces import shift_to_start
 
 
 def predict(

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import select
 from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error, some
 from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
 from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.estimation.rollout import select
 from sb3_reinforce.estimation.scores import scored_parameters
-from sb3_reinforce.policies.evaluation import as_policy_actions
 from sb3_reinforce.reinforce import REINFORCE
 
 

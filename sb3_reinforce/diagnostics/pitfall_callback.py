@@ -9,12 +9,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import TensorOrDict, select, take
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.updates import Seen, Update
-from sb3_reinforce.estimation.rollout import Rollout, TensorOrDict, select, take
+from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import flat, scored_parameters
-from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
 
 

@@ -8,9 +8,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.common.optimization import in_a_row
-from sb3_reinforce.estimation.rollout import take
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import take
 from sb3_reinforce.estimation.scores import flat, score_parameters
-from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
 
 # Draws behind a frequency or a mean action, and for observations of more elements than LARGE
 N_DRAWS, N_DRAWS_LARGE, LARGE = 1024, 256, 4096

@@ -5,11 +5,11 @@ import torch as th
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
 from sb3_reinforce.common.optimization import in_a_row
+from sb3_reinforce.common.tensors import stack
 from sb3_reinforce.diagnostics.policy_errors import relative
 from sb3_reinforce.diagnostics.sampling import Infos, training_weights
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
-from sb3_reinforce.policies.critic import stack
 from sb3_reinforce.reinforce import REINFORCE
 
 

@@ -3,80 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 
 class BadData(ValueError):
     """What an environment returned at this step cannot be learned from."""
-
-
-def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
-    """
-    Check what a user gives a model to learn from.
-
-    :param env: What the user passed; an id that is registered in Gymnasium is made
-    :param verbose: The argument of this name
-    :param n_envs: The number of environments that there must be; None for any
-    :return: The environment
-    :raises TypeError: If it is no environment
-    :raises ValueError: If no policy can act in its spaces, or the number is another
-    """
-    vectorized = isinstance(env, gym.vector.VectorEnv)
-    if vectorized or not (isinstance(env, str) or hasattr(env, "observation_space")):
-        hint = ": wrap it in GymnasiumVecEnv" if vectorized else ""
-        raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")
-    made: GymEnv = maybe_make_env(env, verbose)
-    check_spaces(made.observation_space, made.action_space)
-    found = getattr(made, "num_envs", 1)
-    if n_envs not in (None, found):
-        raise ValueError(
-            f"env must have num_envs={n_envs}, as the model has, got {found}: for another number save the model and "
-            "load it with that env"
-        )
-    return made
-
-
-def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-    """
-    Check that a policy of Stable-Baselines3 can act in these spaces.
-
-    :param observation_space: The environment's observation space
-    :param action_space: The environment's action space
-    :raises ValueError: If it cannot
-    """
-    if not isinstance(action_space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-        raise ValueError(f"The action space must be Box, Discrete, MultiDiscrete or MultiBinary, got {action_space}")
-    if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
-        raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
-    if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
-        raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
-    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) != 1:
-        raise ValueError(f"A MultiDiscrete action space must have one dimension, got {action_space}: flatten it")
-    if 0 in (action_space.shape or ()):
-        raise ValueError(f"The action space must not be empty, got {action_space}")
-    parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-    if not parts:
-        raise ValueError(f"The observation space must not be empty, got {observation_space}")
-    for key, space in parts.items():
-        where = f" under {key!r}" if key else ""
-        if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-            raise ValueError(
-                f"The observation space{where} must be Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these, "
-                f"got {space}"
-            )
-        if isinstance(space, spaces.Box) and not space.shape:
-            raise ValueError(f"The observation space{where} must have a dimension, got {space}: make its shape (1,)")
-        if isinstance(space, spaces.MultiDiscrete) and len(space.shape) != 1:
-            raise ValueError(f"The observation space{where} must have one dimension, got {space}: flatten it")
-        if 0 in (space.shape or ()):
-            raise ValueError(f"The observation space{where} must not be empty, got {space}")
-        if np.any(getattr(space, "start", 0)):
-            raise ValueError(f"The observation space{where} must start at 0, got {space}: subtract its start")
 
 
 def is_finite(values: np.ndarray) -> np.ndarray:

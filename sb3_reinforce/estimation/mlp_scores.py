@@ -12,9 +12,11 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.estimation.rollout import Rollout, select
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import select
+from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.policies.backpropagation import activations, deltas, divided, parameters_of
-from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions
+from sb3_reinforce.policies.evaluation import Parameters
 from sb3_reinforce.policies.plain_mlp import actor_layers, overrides
 
 # Steps that share a forward and a backward pass: what they leave behind is to stay in the cache

@@ -5,7 +5,6 @@ Arrays are of shape ``(n_steps, n_envs)``; ``dones[t]`` is True where the step a
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch as th
@@ -13,8 +12,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.estimation.returns import Bools, Integers
-
-TensorOrDict = TypeVar("TensorOrDict", th.Tensor, PyTorchObs)
 
 
 @dataclass(frozen=True)
@@ -90,38 +87,6 @@ class Extent:
         """
         quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
         return cls(np.inf, quota, max_episode_steps)
-
-
-def flatten(tensors: TensorOrDict) -> TensorOrDict:
-    """
-    All steps of a rollout in a row.
-
-    :param tensors: Shape ``(n_steps, n_envs, ...)``, or a dict of such tensors
-    :return: Shape ``(n_steps * n_envs, ...)``, or a dict of such tensors
-    """
-    return tensors.flatten(0, 1) if isinstance(tensors, th.Tensor) else {k: v.flatten(0, 1) for k, v in tensors.items()}
-
-
-def take(tensors: TensorOrDict, steps: th.Tensor | slice) -> TensorOrDict:
-    """
-    Some of the steps.
-
-    :param tensors: Shape ``(n, ...)`` or ``(n_steps, n_envs, ...)``, or a dict of such tensors
-    :param steps: The indices, a slice, or a mask of shape ``(n_steps, n_envs)``
-    :return: These steps in a row, or a dict of such tensors
-    """
-    return tensors[steps] if isinstance(tensors, th.Tensor) else {key: part[steps] for key, part in tensors.items()}
-
-
-def select(tensors: TensorOrDict, used: th.Tensor) -> TensorOrDict:
-    """
-    The steps of a rollout that a mask names, in a row, without a copy where it names all of them.
-
-    :param tensors: Shape ``(n_steps, n_envs, ...)``, or a dict of such tensors
-    :param used: Mask of shape ``(n_steps, n_envs)`` with ``n`` True entries
-    :return: Shape ``(n, ...)``, or a dict of such tensors
-    """
-    return flatten(tensors) if bool(used.all()) else take(tensors, used)
 
 
 def within_quota(dones: Bools, quota: Integers) -> Bools:

@@ -7,9 +7,11 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import flatten, select, take
 from sb3_reinforce.estimation.mlp_scores import factored_layers, mlp_gradients
-from sb3_reinforce.estimation.rollout import Rollout, flatten, select, take
-from sb3_reinforce.policies.evaluation import Parameters, as_policy_actions, log_prob_and_entropy, reached
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy, reached
 
 # The most steps that share a gradient while they are summed: fewer would write more gradients
 PIECE = 128

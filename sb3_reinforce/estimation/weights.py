@@ -11,12 +11,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import select
 from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, reward_to_go, total_return
-from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode, select, timesteps_of, within_quota
+from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode, timesteps_of, within_quota
 from sb3_reinforce.policies.critic import values_after, values_of
-from sb3_reinforce.policies.evaluation import as_policy_actions
 from sb3_reinforce.sampling.collection import Ends, by_step
 
 

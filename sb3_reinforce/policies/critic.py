@@ -14,8 +14,8 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
+from sb3_reinforce.common.tensors import flatten, stack, take
 from sb3_reinforce.estimation.returns import Floats
-from sb3_reinforce.estimation.rollout import flatten, take
 from sb3_reinforce.policies.backpropagation import activations, squared_error
 from sb3_reinforce.policies.evaluation import Parameters, tells_values
 from sb3_reinforce.policies.plain_mlp import critic_layers, overrides
@@ -70,18 +70,6 @@ def value_function(policy: ActorCriticPolicy) -> Callable[[Any], th.Tensor]:
     """
     layers = critic_layers(policy)
     return policy.predict_values if layers is None else lambda obs: activations(layers, obs.flatten(1).float())[-1]
-
-
-def stack(observations: list[Any]) -> Any:
-    """
-    Make a batch of single observations.
-
-    :param observations: ``n`` observations, arrays or dicts of arrays
-    :return: Shape ``(n, ...)``, or a dict of such arrays
-    """
-    if isinstance(observations[0], dict):
-        return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
-    return np.stack(observations)
 
 
 def fit_critic(

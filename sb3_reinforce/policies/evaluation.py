@@ -5,10 +5,9 @@ A method that the user has overridden is called as it is; where nothing is overr
 """
 
 import math
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -17,17 +16,6 @@ from sb3_reinforce.policies.backpropagation import through
 from sb3_reinforce.policies.plain_mlp import DivideLogits, actor_layers, overrides
 
 Parameters: TypeAlias = list[th.nn.Parameter]
-
-
-def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
-    """
-    Stored actions in the form that ``evaluate_actions`` takes.
-
-    :param actions: Shape ``(n, action_dim)``
-    :param action_space: The action space
-    :return: Shape ``(n,)``, int64 for Discrete, else ``(n, action_dim)``, float32
-    """
-    return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions.float()
 
 
 def tells_values(policy: ActorCriticPolicy, with_critic: bool) -> bool:

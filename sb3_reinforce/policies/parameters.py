@@ -1,15 +1,14 @@
 """θ, the parameters of a policy's actor, as one vector."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.policies.evaluation import as_policy_actions, log_prob_and_entropy, reached
+from sb3_reinforce.common.spaces import as_policy_actions, zeros
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy, reached
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -33,17 +32,6 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"
         )
     return parameters
-
-
-def zeros(space: spaces.Space[Any]) -> Any:
-    """
-    A batch of one element of a space, all zeros.
-
-    :param space: A Box, a discrete space, or a Dict of them
-    """
-    if isinstance(space, spaces.Dict):
-        return {key: zeros(part) for key, part in space.spaces.items()}
-    return np.zeros((1, *(space.shape or ())), dtype=space.dtype)
 
 
 def read(parameters: Sequence[th.Tensor]) -> th.Tensor:

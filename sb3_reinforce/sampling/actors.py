@@ -21,13 +21,9 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.estimation.rollout import flatten
-from sb3_reinforce.policies.evaluation import (
-    as_policy_actions,
-    distribution_of,
-    log_prob_and_entropy,
-    tells_values,
-)
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import flatten
+from sb3_reinforce.policies.evaluation import distribution_of, log_prob_and_entropy, tells_values
 from sb3_reinforce.policies.passes import Floats, lay_out
 from sb3_reinforce.policies.plain_mlp import actor_layers
 

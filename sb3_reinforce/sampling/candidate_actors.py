@@ -17,9 +17,9 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.func import functional_call, vmap
 
+from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.plain_mlp import DISTRIBUTIONS, overrides
-from sb3_reinforce.sampling.collection import env_actions_of, shift_to_start
 
 # What an action goes through in ActorCriticPolicy; a policy with its own version of one of them is called as it is
 ACTION_METHODS = ("predict", "_predict", "get_distribution", "_get_action_dist_from_latent", "obs_to_tensor")

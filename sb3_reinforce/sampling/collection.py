@@ -5,18 +5,16 @@ It stands apart from ``rollouts``, which holds what was collected and the pure f
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.envs.stepping import stepper
 from sb3_reinforce.estimation.returns import Bools
@@ -126,36 +124,6 @@ def hears(callback: BaseCallback) -> bool:
     :param callback: What ``learn`` was given, as a callback
     """
     return not (type(callback) is ConvertCallback and callback.callback is None)
-
-
-def env_actions_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[np.ndarray], np.ndarray]:
-    """
-    How the policy's actions become those of the environment: clipped or unscaled to a Box, shifted to a discrete start.
-
-    :param policy: The policy
-    :param n_envs: Number of environments
-    :return: A function of actions of shape ``(n_envs, *action_space.shape)``
-    """
-    space = policy.action_space
-    if isinstance(space, spaces.Box):
-        # Bounds for each environment: to broadcast them at each step takes longer than to clip
-        low, high = (np.repeat(bound[None], n_envs, axis=0) for bound in (space.low, space.high))
-        return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(low, high)
-    if np.any(getattr(space, "start", 0)):
-        return lambda actions: shift_to_start(space, actions)
-    return lambda actions: actions
-
-
-def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
-    """
-    Actions counted from 0, as policies count, to actions of the space.
-
-    :param space: An action space; Discrete and MultiDiscrete may have a start
-    :param actions: Shape ``(..., *space.shape)``
-    :return: The same shape
-    """
-    start = getattr(space, "start", 0)
-    return actions + start if np.any(start) else actions
 
 
 def write(rows: Any, step: int, values: Any) -> None:

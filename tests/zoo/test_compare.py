@@ -21,7 +21,7 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy
 
 from sb3_reinforce.zoo import HYPERPARAMS, experiments
 
-BENCHMARKS = Path(__file__).parent.parent / "examples" / "benchmarks"
+BENCHMARKS = Path(__file__).parents[2] / "examples" / "benchmarks"
 # The Zoo and what it calls warn of their own affairs
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 import torch as th
+from enumeration import LOGITS, episode_terms, log_pi
 from environments import Tree
-from test_enumeration import LOGITS, episode_terms, log_pi
 
 from sb3_reinforce.diagnostics.bootstrap import interval, resamples
 from sb3_reinforce.diagnostics.estimator_comparison import estimator_row

@@ -6,10 +6,10 @@ import sys
 import numpy as np
 import pytest
 import torch as th
+from enumeration import make_model, true_gradient
 from environments import Corridor, Tree
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
-from test_enumeration import make_model, true_gradient
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape

@@ -1,0 +1,115 @@
+"""
+The expected gradient by exact enumeration: the sum over all batches of N episodes of their probability times ĝ.
+
+The policy is a softmax over a table, in float64; the batch goes through the package's own returns, baselines and
+denominators. ∇E[G_0] comes from autograd through the probabilities of the trajectories.
+"""
+
+from itertools import product
+
+import numpy as np
+import torch as th
+from environments import Tree
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.estimation.rollout import Extent
+from sb3_reinforce.estimation.weights import Running, weigh
+from sb3_reinforce.sampling.collection import Ends
+
+GAMMA = 0.5
+LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
+
+
+class DoubleExtractor(FlattenExtractor):
+    """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
+
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+def make_model(ragged=False, **kwargs):
+    arguments = {"gamma": GAMMA, "n_episodes": 2, "normalize_by": "episodes", "discount_scores": True, **kwargs}
+    policy_kwargs = {"net_arch": [], "features_extractor_class": DoubleExtractor}
+    th.set_default_dtype(th.float64)
+    model = REINFORCE("MlpPolicy", Tree(ragged), policy_kwargs=policy_kwargs, device="cpu", **arguments)
+    th.set_default_dtype(th.float32)
+    with th.no_grad():
+        model.policy.action_net.weight.copy_(LOGITS.T)
+        model.policy.action_net.bias.zero_()
+    model.policy.action_net.bias.requires_grad_(False)
+    return model
+
+
+def log_pi(logits, node, action):
+    return logits[node].log_softmax(0)[action]
+
+
+def score(node, action):
+    logits = LOGITS.clone().requires_grad_()
+    return th.autograd.grad(log_pi(logits, node, action), logits)[0]
+
+
+def true_gradient(trajectories, utility):
+    """∇ Σ p(τ) utility(τ)."""
+    logits = LOGITS.clone().requires_grad_()
+    expected = sum(
+        th.stack([log_pi(logits, node, action) for node, action, _ in trajectory]).sum().exp() * utility(trajectory)
+        for trajectory in trajectories
+    )
+    return th.autograd.grad(expected, logits)[0]
+
+
+def discounted_return(trajectory, begin=0):
+    return sum(GAMMA**k * reward for k, (_, _, reward) in enumerate(trajectory[begin:]))
+
+
+def fill(model, batch):
+    """
+    A rollout buffer that holds one episode per environment.
+
+    An environment that has ended its episode has gone on; what it did then has absurd rewards and must not be used.
+    """
+    n_steps, n_envs = max(map(len, batch)), len(batch)
+    buffer = RolloutBuffer(n_steps, model.observation_space, model.action_space, "cpu", n_envs=n_envs)
+    buffer.rewards += 1e6
+    dones = np.zeros((n_steps, n_envs), dtype=bool)
+    for i, trajectory in enumerate(batch):
+        for t, (node, action, reward) in enumerate(trajectory):
+            buffer.observations[t, i], buffer.actions[t, i], buffer.rewards[t, i] = Tree.observe(node), action, reward
+        dones[len(trajectory) - 1, i] = True
+    return buffer, Ends(dones, {})
+
+
+def estimate(model, batch):
+    """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
+    buffer, ends = fill(model, batch)
+    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
+    rollout = weigh(
+        model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing
+    )
+    weights = rollout.discounts * (rollout.returns - model._weighing.baseline(rollout)) * rollout.used
+    terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
+    return sum(terms) / model._denominator(rollout), int(rollout.used.sum())
+
+
+def expectation(model, trajectories, n_episodes, statistic):
+    """Σ over all batches of p(batch) · statistic(ĝ, number of steps)."""
+    total = 0.0
+    for batch in product(trajectories, repeat=n_episodes):
+        log_p = th.stack([log_pi(LOGITS, node, action) for episode in batch for node, action, _ in episode]).sum()
+        total = total + log_p.exp() * statistic(*estimate(model, batch))
+    return total
+
+
+def expected_gradient(model, n_episodes=2):
+    return expectation(model, model.env.envs[0].unwrapped.trajectories(), n_episodes, lambda gradient, steps: gradient)
+
+
+def gradient_of_return(model):
+    return true_gradient(model.env.envs[0].unwrapped.trajectories(), discounted_return)
+
+
+def assert_equal(gradient, expected):
+    th.testing.assert_close(gradient, expected, rtol=0, atol=1e-10)
