@@ -113,3 +113,12 @@ def gradient_of_return(model):
 
 def assert_equal(gradient, expected):
     th.testing.assert_close(gradient, expected, rtol=0, atol=1e-10)
+
+
+def episode_terms(trajectory, reward_to_go):
+    """A and S of an episode: Σ_t γ^t score_t G_t and Σ_t γ^t score_t, or Σ_t score_t G_0 and Σ_t score_t."""
+    discounts = [GAMMA ** (t * reward_to_go) for t in range(len(trajectory))]
+    returns = [discounted_return(trajectory, t * reward_to_go) for t in range(len(trajectory))]
+    scores = [score(node, action).flatten() for node, action, _ in trajectory]
+    weighted = [d * g * s for d, g, s in zip(discounts, returns, scores, strict=True)]
+    return sum(weighted), sum(d * s for d, s in zip(discounts, scores, strict=True))

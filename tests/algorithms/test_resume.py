@@ -78,7 +78,8 @@ def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
     model.save(tmp_path / "model")
     env.save(tmp_path / "statistics.pkl")
     here = Path(__file__)
-    code = f"import sys; sys.path[:0] = [{str(here.parent)!r}, {str(here.parents[1])!r}]; import pathlib, test_resume as t; "
+    folders = [str(here.parent), str(here.parents[1])]
+    code = f"import sys; sys.path[:0] = {folders}; import pathlib, test_resume as t; "
     code += f"t.th.set_num_threads(1); t.go_on({kind!r}, pathlib.Path({str(tmp_path)!r}))"
     expected = finish(model, env)
     subprocess.run([sys.executable, "-c", code], check=True)

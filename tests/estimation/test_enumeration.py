@@ -11,17 +11,16 @@ from itertools import product
 import pytest
 import torch as th
 from enumeration import (
-    GAMMA,
     LOGITS,
     assert_equal,
     discounted_return,
+    episode_terms,
     expectation,
     expected_gradient,
     fill,
     gradient_of_return,
     log_pi,
     make_model,
-    score,
     true_gradient,
 )
 from environments import Tree
@@ -103,15 +102,6 @@ def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
 def test_dividing_by_steps_only_rescales_where_lengths_are_equal():
     model = make_model(baseline="none", normalize_by="steps")
     assert_equal(2 * expected_gradient(model), gradient_of_return(model))
-
-
-def episode_terms(trajectory, reward_to_go):
-    """A and S of an episode: Σ_t γ^t score_t G_t and Σ_t γ^t score_t, or Σ_t score_t G_0 and Σ_t score_t."""
-    discounts = [GAMMA ** (t * reward_to_go) for t in range(len(trajectory))]
-    returns = [discounted_return(trajectory, t * reward_to_go) for t in range(len(trajectory))]
-    scores = [score(node, action).flatten() for node, action, _ in trajectory]
-    weighted = [d * g * s for d, g, s in zip(discounts, returns, scores, strict=True)]
-    return sum(weighted), sum(d * s for d, s in zip(discounts, scores, strict=True))
 
 
 @pytest.mark.parametrize("reward_to_go", [False, True])
