@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.envs.checks import check_finite
-from sb3_reinforce.envs.stepping import stepper
 from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.estimation.rollout import Extent
 from sb3_reinforce.sampling.actors import make_actor
@@ -61,7 +60,7 @@ def collect(
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
-    as_env_actions, step, is_heard = env_actions_of(policy, env.num_envs), stepper(env), hears(callback)
+    as_env_actions, is_heard = env_actions_of(policy, env.num_envs), hears(callback)
     # A copy: some VecEnvs reuse the array of the dones
     first, all_dones = np.array(model._last_episode_starts, dtype=bool), list[Bools]()
     terminal_obs: dict[tuple[int, int], Any] = {}
@@ -85,7 +84,7 @@ def collect(
             write(rollout_buffer.log_probs, n_steps, log_probs)
 
         clipped_actions = as_env_actions(actions)
-        new_obs, rewards, dones, infos = step(clipped_actions)
+        new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
         model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
 
