@@ -69,7 +69,7 @@ class Pipe:
                 # Also an answer that cannot be unpickled has been read
                 self.question = ""
                 return self.remote.recv()
-        except (EOFError, ConnectionError) as error:
+        except (EOFError, OSError) as error:
             self.question = ""
             raise self.death() from error
 
