@@ -5,6 +5,7 @@ It stands apart from ``rollouts``, which holds what was collected and the pure f
 """
 
 import warnings
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,6 +84,9 @@ def collect(
             write(rollout_buffer.values, n_steps, values)
             write(rollout_buffer.log_probs, n_steps, log_probs)
 
+        if model.use_sde:
+            # Its standard deviation may overflow, and the environment would be blamed
+            check_finite("The action", actions, (None,))
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
@@ -100,7 +104,7 @@ def collect(
             model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
             for i in wanted.tolist():
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    terminal_obs[n_steps, i] = infos[i]["terminal_observation"]
+                    terminal_obs[n_steps, i] = deepcopy(infos[i]["terminal_observation"])
             owed[wanted] -= 1
             begun[wanted] = n_steps + 1
             if extent.n_steps == np.inf:
