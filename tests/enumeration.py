@@ -14,8 +14,9 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.rollout import Extent
-from sb3_reinforce.estimation.weights import Running, weigh
+from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation.rollout import Running
+from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.sampling.collection import Extent
 
 GAMMA = 0.5
@@ -79,19 +80,26 @@ def fill(model, batch):
         for t, (node, action, reward) in enumerate(trajectory):
             buffer.observations[t, i], buffer.actions[t, i], buffer.rewards[t, i] = Tree.observe(node), action, reward
         dones[len(trajectory) - 1, i] = True
-    return buffer, Ends(dones, {})
+    return buffer, dones
+
+
+def rollout_of(model, batch):
+    """What the package makes of a batch of episodes: returns, masks, denominator and advantages."""
+    buffer, dones = fill(model, batch)
+    model._running = Running.none(len(batch))
+    model._last_obs = buffer.observations[-1]
+    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
+    model.n_episodes = len(batch)
+    rollout = model._complete(buffer, route_of(model.policy, model.has_critic), dones, {}, extent)
+    return rollout, BASELINES.get(str(model.baseline), model.baseline)(rollout)
 
 
 def estimate(model, batch):
     """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
-    buffer, ends = fill(model, batch)
-    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
-    rollout = weigh(
-        model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing
-    )
-    weights = rollout.discounts * (rollout.returns - model._weighing.baseline(rollout)) * rollout.used
+    rollout, baseline = rollout_of(model, batch)
+    weights = rollout.discounts * (rollout.returns - baseline) * rollout.used
     terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
-    return sum(terms) / model._denominator(rollout), int(rollout.used.sum())
+    return sum(terms) / rollout.denominator, int(rollout.used.sum())
 
 
 def expectation(model, trajectories, n_episodes, statistic):
