@@ -1,6 +1,5 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
-import math
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -19,26 +18,23 @@ from stable_baselines3.common.utils import explained_variance, update_learning_r
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_flag, check_function
-from sb3_reinforce.common.base import Persistent
-from sb3_reinforce.common.common_settings import check_basics, check_learn
+from sb3_reinforce.common.arguments import check_function
+from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.prediction import predict
-from sb3_reinforce.common.settings import check_reinforce
-from sb3_reinforce.common.spaces import check_env
+from sb3_reinforce.common.settings import REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode
 from sb3_reinforce.estimation.weights import Running, Steps, Weighing, used_steps, weigh
 from sb3_reinforce.policies.critic import fit_critic
-from sb3_reinforce.policies.evaluation import MAX_TEMPERATURE, Parameters, floor_std, set_temperature, split_parameters
+from sb3_reinforce.policies.evaluation import Parameters, floor_std, set_temperature, split_parameters
 from sb3_reinforce.policies.policy_step import step_policy
 from sb3_reinforce.sampling.collection import check_data, collect, warn_of_own_methods
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
 
-class REINFORCE(Persistent, OnPolicyAlgorithm):
+class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
@@ -112,7 +108,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
-    predict = predict
+    _arguments = REINFORCE_ARGUMENTS
 
     def __init__(
         self,
@@ -149,27 +145,24 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
-        check_flag("use_sde", use_sde)
-        if env is not None or _init_setup_model:
-            env = check_env(env, verbose)
         super().__init__(
             policy,
             env,
+            needs_env=_init_setup_model,
             learning_rate=learning_rate,
-            n_steps=n_steps,  # type: ignore[arg-type]
+            n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
-            ent_coef=ent_coef,  # type: ignore[arg-type]
+            ent_coef=ent_coef,
             vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             rollout_buffer_class=rollout_buffer_class,
             rollout_buffer_kwargs=rollout_buffer_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=None if policy_kwargs is None else dict(policy_kwargs),
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
@@ -201,19 +194,12 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         baseline = check_function("baseline", self.baseline, BASELINES)
         return Weighing(baseline, self.gamma, self.gae_lambda, self.reward_to_go, self.discount_scores)
 
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate, high=MAX_LEARNING_RATE)
-
-    def _scheduled(self, name: str, above: bool = False, high: float = math.inf) -> float:
-        """The present value of an argument that may be a schedule, and that a callback may have set anew."""
-        return CheckedSchedule(name, getattr(self, name), above=above, high=high)(self._current_progress_remaining)
-
     def _critic_rate(self) -> float:
         name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
-        return self._scheduled(name, high=MAX_LEARNING_RATE)
+        return self._scheduled(name)
 
     def _setup_model(self) -> None:
-        check_reinforce(self)
+        check_reinforce(self, BASELINES)
         # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout sizes it anew
         n_steps, self.n_steps = self.n_steps, self.n_steps or 1
         super()._setup_model()
@@ -249,12 +235,8 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         return groups
 
     def _apply_temperature_and_floor(self) -> None:
-        set_temperature(self.policy, self._scheduled("temperature", above=True, high=MAX_TEMPERATURE))
+        set_temperature(self.policy, self._scheduled("temperature"))
         floor_std(self.policy, self.min_std)
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # A last rollout that overshoots total_timesteps must not train at a negative rate
-        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None

@@ -132,8 +132,8 @@ def reached(output: th.Tensor, parameters: Parameters) -> list[bool]:
     return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
 
 
-# The logits of float32 networks at the one temperature leave one action, at the other none preferred
-MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e6
+# At this temperature the logits of float32 networks leave one action
+MIN_TEMPERATURE = 1e-3
 
 
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
