@@ -16,10 +16,12 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
+from sb3_reinforce.estimation.weights import complete_rollout
+from sb3_reinforce.policies.critic import values_after, values_along
 from sb3_reinforce.policies.evaluation import route_of
-from sb3_reinforce.sampling.collection import Extent
 
 GAMMA = 0.5
+ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normalize_by")
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
 
 
@@ -86,12 +88,23 @@ def fill(model, batch):
 def rollout_of(model, batch):
     """What the package makes of a batch of episodes: returns, masks, denominator and advantages."""
     buffer, dones = fill(model, batch)
-    model._running = Running.none(len(batch))
-    model._last_obs = buffer.observations[-1]
-    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
-    model.n_episodes = len(batch)
-    rollout = model._complete(buffer, route_of(model.policy, model.has_critic), dones, {}, extent)
-    return rollout, BASELINES.get(str(model.baseline), model.baseline)(rollout)
+    baseline = BASELINES.get(str(model.baseline), model.baseline)
+    next_values = None
+    if model.has_critic:
+        route = route_of(model.policy, with_critic=True)
+        buffer.values = values_along(model.policy, route, buffer)
+        next_values = values_after(model.policy, route, buffer.values, dones, buffer.observations[-1], {})
+    rollout = complete_rollout(
+        buffer,
+        model.policy,
+        dones,
+        np.ones(len(batch), dtype=int),
+        Running.none(len(batch)),
+        next_values,
+        baseline=baseline,
+        **{name: getattr(model, name) for name in ARGUMENTS},
+    )
+    return rollout, baseline(rollout)
 
 
 def estimate(model, batch):

@@ -25,7 +25,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.estimation.estimators import central_difference
@@ -351,58 +351,6 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
 
     model = make(Line(), estimator=estimator, perturbation=perturbation, learning_rate=0.1).learn(2000)
     assert float(model.theta) == pytest.approx(3, abs=0.3)
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "error", "match"),
-    [
-        (dict(estimator="backward"), ValueError, "estimator must be .*'central'.* got 'backward'"),
-        (dict(estimator=3), TypeError, "estimator must be a name or a callable, got 3"),
-        (dict(perturbation="cube"), ValueError, "perturbation must be .*'sphere'.* got 'cube'"),
-        (dict(n_delta=0), ValueError, "n_delta must be at least 1, got 0"),
-        (dict(n_delta=1, estimator="regression"), ValueError, "n_delta must be at least 2, got 1"),
-        (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
-        (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
-        (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
-        (dict(delta_std=lambda progress: 1 - progress), ValueError, "delta_std .at progress 1. must be finite and > 0"),
-        (
-            dict(delta_std=lambda progress: 2 * progress - 1),
-            ValueError,
-            "delta_std .at progress 0. must be finite and >= 0",
-        ),
-        (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
-        (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
-        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0 and <= 1e.06, got -1"),
-        (dict(max_grad_norm=0), ValueError, "max_grad_norm must be finite and > 0, got 0"),
-        (dict(n_top=4), ValueError, "n_top=4 needs an n_delta of at least that, got n_delta=3"),
-        (dict(n_top=1, estimator="forward"), ValueError, "n_top=1 needs estimator='central'"),
-        (dict(policy="NoPolicy"), ValueError, "NoPolicy"),
-        (dict(policy=th.nn.Linear), TypeError, "policy must be a name or a subclass of ActorCriticPolicy"),
-    ],
-)
-def test_bad_arguments_are_named(kwargs: dict[str, Any], error: type[Exception], match: str) -> None:
-    with pytest.raises(error, match=match):
-        make(**kwargs)
-
-
-def test_bad_arguments_of_learn_are_named() -> None:
-    for kwargs in (dict(total_timesteps=float("nan")), dict(total_timesteps=10, log_interval=0)):
-        with pytest.raises(ValueError, match=str(list(kwargs)[-1])):
-            make().learn(**kwargs)
-
-
-@pytest.mark.parametrize(
-    "space", [spaces.Tuple([spaces.Discrete(2)]), spaces.Text(3), spaces.Sequence(spaces.Discrete(2))]
-)
-def test_unsupported_spaces_are_an_error(space: spaces.Space) -> None:
-    class Odd(Line):
-        pass
-
-    for name in ("observation_space", "action_space"):
-        env = Odd()
-        setattr(env, name, space)
-        with pytest.raises(ValueError, match=f"{name.split('_')[0]} space must be"):
-            make(DummyVecEnv([lambda env=env: env]) if name == "action_space" else env)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.estimation.weights import standardize
 
 GAMMA = 0.5
 N_OBS = 5
