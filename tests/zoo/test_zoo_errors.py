@@ -14,19 +14,12 @@ import rl_zoo3
 import stable_baselines3
 from huggingface_hub.errors import HTTPError
 from rl_zoo3.exp_manager import ExperimentManager
-from zoo_commands import train, zoo
+from zoo_commands import message_of, train
 
 from sb3_reinforce.zoo import __main__
 
 # The Zoo and what it calls warn of their own affairs
 pytestmark = pytest.mark.filterwarnings("ignore")
-
-
-def message_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """What a command that cannot be run says last."""
-    with pytest.raises(SystemExit):
-        zoo(*arguments)
-    return capsys.readouterr().err.rpartition("error: ")[2]
 
 
 def raising(error: Exception) -> Callable[..., None]:
@@ -73,9 +66,15 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, seed: 5", "'seed' is not a setting"),
         ("policy: MlpPolicy, n_timesteps: 100, gamma: 3", "gamma must be finite and >= 0 and <= 1, got 3"),
         ("policy: MlpPolicy, n_timesteps: 100, gamma: x", "gamma must be a number, got 'x' of type str"),
-        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: 'dict('", "policy_kwargs must be Python, but of 'dict('"),
+        (
+            "policy: MlpPolicy, n_timesteps: 100, policy_kwargs: 'dict('",
+            "must be Python, but 'dict(' raises SyntaxError",
+        ),
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: [1]", "policy_kwargs must be a dict"),
-        ("policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm", "normalize must be Python, but of 'nn.Norm'"),
+        (
+            "policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm",
+            "but 'nn.Norm' raises AttributeError",
+        ),
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
         ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
         ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: 3", "env_kwargs must be a dict, got 3"),
@@ -118,9 +117,9 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
         (["fly"], "there is no command 'fly', only train, enjoy"),
         (["push_to_hub"], "push_to_hub is not offered"),
         (["train", "--algo", "reinforc"], "invalid choice: 'reinforc'"),
-        (["train", "--env", "CartPol-v1"], "--env CartPol-v1 is not registered, but CartPole-v"),
+        (["train", "--env", "CartPol-v1"], "--gym-packages PACKAGE): did you mean CartPole-v"),
         (["train", "-params", "baseline:none"], "write a text as"),
-        (["train", "-params", "n_steps:1/0"], "'n_steps:1/0' the value must be Python, but it says ZeroDivisionError"),
+        (["train", "-params", "n_steps:1/0"], "the value of 'n_steps:1/0' must be Python (ZeroDivisionError"),
         (["train", "-params", "gamma:0.9", "n_steps=5"], "'n_steps=5' must be KEY:VALUE"),
         (["train", "--trial-id", "1"], "--trial-id needs --storage and --study-name"),
         (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
@@ -137,17 +136,6 @@ def test_a_wrong_command_is_answered_with_a_sentence(
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     assert sentence in message_of(capsys, *arguments)
-
-
-@pytest.mark.parametrize(("study", "trial"), [("other", "0"), ("study", "7")])
-def test_a_trial_that_is_missing_is_named(
-    study: str, trial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    storage = ("--storage", "sqlite:///study.db", "--study-name")
-    train("reinforce", "-optimize", "--n-trials", "1", "--n-evaluations", "1", "-n", "100", *storage, "study")
-    message = message_of(capsys, "train", "--algo", "reinforce", *storage, study, "--trial-id", trial)
-    assert f"no trial {trial} of reinforce in a study '{study}'" in message
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])

@@ -1,13 +1,7 @@
 """Which settings an algorithm gets in the Zoo: published, of a model, of a trial; and what they are turned into."""
 
-import argparse
-import importlib
-import inspect
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 
@@ -21,11 +15,9 @@ import torch as th
 import yaml
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
-from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from zoo_commands import RUN, config_of, train, zoo
+from zoo_commands import RUN, config_of, message_of, train, zoo
 
-import sb3_reinforce.zoo
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
 # The Zoo and what it calls warn of their own affairs
@@ -100,17 +92,6 @@ def test_the_default_trains_on_dicts(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_model_can_be_loaded_without_the_zoo(name: str, tmp_path: Path) -> None:
-    entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1") | {"policy": "MlpPolicy", "n_timesteps": 64}
-    train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
-    path, algorithm = str(tmp_path / name / RUN / "CartPole-v1.zip"), ALGORITHMS[name].__name__
-    code = "import sys; sys.modules['rl_zoo3'] = None; import sb3_reinforce as s"
-    code += f"; print(s.{algorithm}.load({path!r}).learning_rate(0.5))"
-    told = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.split()[-1] == "0.25"
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_argument_that_may_be_a_schedule_may_fall(name: str, tmp_path: Path) -> None:
     entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1")
     entry = {"policy": "MlpPolicy", "n_timesteps": 64, **({"n_delta": 2} if "delta_std" in entry else {}), **entry}
@@ -146,25 +127,10 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path: Path) -> None
     assert load(tmp_path / "reinforce" / "CartPole-v1_2").gamma == 0.5
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_the_settings_are_found_beside_an_installed_and_a_cloned_zoo(installed: bool) -> None:
-    # Where this folder is missing the Zoo looks one above
-    with mock.patch.object(Path, "is_dir", lambda path: installed):
-        manager = ExperimentManager(argparse.Namespace(), "reinforce", "CartPole-v1", "")
-    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())["CartPole-v1"]
-    assert manager.read_hyperparameters()[0] == published
-
-
-def test_a_reload_changes_nothing() -> None:
-    importlib.reload(sb3_reinforce.zoo.experiments)
-    importlib.reload(sb3_reinforce.zoo)
-    for name in ("read_hyperparameters", "_preprocess_hyperparams", "setup_experiment"):
-        method = getattr(ExperimentManager, name).__wrapped__
-        assert method is inspect.unwrap(method) and method.__globals__["__name__"] == "rl_zoo3.exp_manager"
-
-
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optuna_tunes_and_its_trials_can_be_trained(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
     train(name, "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--no-optim-plots", *study)
@@ -173,9 +139,11 @@ def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, m
     assert [trial.state.name for trial in trials] == ["COMPLETE", "COMPLETE"]
     for number, trial in enumerate(trials):
         train(name, *study, "--trial-id", str(number))
-        assert (
-            config_of(Path(f"logs/{name}/CartPole-v1_{number + 2}"))["learning_rate"] == trial.params["learning_rate"]
-        )
+        config = config_of(Path(f"logs/{name}/CartPole-v1_{number + 2}"))
+        assert config["learning_rate"] == trial.params["learning_rate"]
+    for options in (("--trial-id", "7"), ("--study-name", "other", "--trial-id", "0")):
+        message = message_of(capsys, "train", "--algo", name, *study, *options)
+        assert f"no trial {options[-1]} of {name} in a study '{'other' if 'other' in options else 'study'}'" in message
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
