@@ -20,6 +20,7 @@ from sb3_reinforce.zoo import __main__
 
 # The Zoo and what it calls warn of their own affairs
 pytestmark = pytest.mark.filterwarnings("ignore")
+REINFORCE = ["train", "--algo", "reinforce"]
 
 
 def raising(error: Exception) -> Callable[..., None]:
@@ -91,16 +92,6 @@ def test_a_wrong_setting_is_named(
     assert sentence in message_of(capsys, *arguments)
 
 
-def test_a_conf_file_that_is_missing_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "nowhere.yml cannot be read" in message_of(capsys, "train", "--algo", "reinforce", "-conf", "nowhere.yml")
-
-
-def test_a_temperature_that_was_asked_for_is_not_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["train", "--algo", "reinforce", "--env", "Pendulum-v1", "-f", str(tmp_path)]
-    sentence = "temperature=0.5 is for discrete actions"
-    assert sentence in message_of(capsys, *arguments, "-params", "temperature:0.5")
-
-
 @pytest.mark.parametrize("error", [ValueError("another"), TypeError("f() got an unexpected keyword argument 'x'")])
 def test_an_error_that_is_not_of_the_configuration_stays_one(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -124,8 +115,12 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
         (["train", "--trial-id", "1"], "--trial-id needs --storage and --study-name"),
         (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
         (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
+        ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
+        ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
+        # A temperature in the default entry is left out, but not one that was asked for
+        ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "no published models of reinforce"),
-        (["train", "--algo", "reinforce", "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
+        ([*REINFORCE, "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
         (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
         (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
     ],
@@ -170,11 +165,3 @@ def test_a_package_of_the_extra_that_is_missing_is_named(
     monkeypatch.setitem(sys.modules, "seaborn", None)
     message = message_of(capsys, "plot_train")
     assert "seaborn" in message and "pip install 'sb3-reinforce[zoo]'" in message
-
-
-def test_a_missing_package_of_the_user_is_not_put_down_to_the_extra(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wrapper = ("-params", "env_wrapper:'nope_pkg.Wrapper'")
-    message = message_of(capsys, "train", "--algo", "reinforce", "-f", str(tmp_path), *wrapper)
-    assert "No module named 'nope_pkg'" in message and "sb3-reinforce" not in message

@@ -22,11 +22,6 @@ from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
 # The Zoo and what it calls warn of their own affairs
 pytestmark = pytest.mark.filterwarnings("ignore")
-TASKS = {
-    "CartPole-v1", "Acrobot-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1", "LunarLander-v3",
-    "LunarLanderContinuous-v3", "BipedalWalker-v3", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Swimmer-v5",
-    "Ant-v5", "InvertedPendulum-v5", "Reacher-v5",
-}  # fmt: skip
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
     "finite_difference": {"learning_rate", "delta_std"},
@@ -46,18 +41,6 @@ def conf(folder: Path, **entries: Any) -> tuple[str, ...]:
     """Arguments that name a configuration with these entries, whose runs go to the same folder."""
     (folder / "conf.yml").write_text(yaml.safe_dump(entries))
     return "-conf", str(folder / "conf.yml"), "-f", str(folder), "--eval-freq", "-1"
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_default_trains_on_observations_that_cannot_be_normalized(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="FrozenLake-v1")
-    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
-    assert published.pop("normalize")
-    assert config_of(tmp_path / name / "FrozenLake-v1_1") == published
-    zoo("enjoy", "--algo", name, "--env", "FrozenLake-v1", "-f", str(tmp_path), "--no-render", "-n", "100")
-    assert "Mean reward: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -80,15 +63,21 @@ class Dicts(gym.ObservationWrapper[Any, Any, Any]):
         return {"obs": observation, "one": 1}
 
 
+@pytest.mark.parametrize(("env", "changed"), [("FrozenLake-v1", {}), ("Dicts-v0", {"policy": "MultiInputPolicy"})])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_default_trains_on_dicts(name: str, tmp_path: Path) -> None:
-    gym.register("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
-    try:
-        train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="Dicts-v0")
-    finally:
-        del gym.registry["Dicts-v0"]
-    config = config_of(tmp_path / name / "Dicts-v0_1")
-    assert config["policy"] == "MultiInputPolicy" and "normalize" not in config
+def test_the_published_default_trains_on_observations_that_cannot_be_normalized(
+    name: str, env: str, changed: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    spec = gym.envs.registration.EnvSpec("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Dicts-v0", spec)
+    common = ("-f", str(tmp_path), "-n", "100")
+    train(name, *common, "--eval-freq", "-1", env=env)
+    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
+    assert published.pop("normalize")
+    assert config_of(tmp_path / name / f"{env}_1") == published | changed
+    zoo("enjoy", "--algo", name, "--env", env, *common, "--no-render")
+    assert "Mean reward: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -159,20 +148,10 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name: s
             ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
 
 
-def test_the_settings_cover_what_is_promised() -> None:
-    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
-    assert published.keys() >= TASKS | {"atari", "default"}
+ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
 
 
-@pytest.mark.parametrize(
-    ("name", "env"),
-    [
-        (name, env)
-        for name in ALGORITHMS
-        for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
-        if env not in ("atari", "default")
-    ],
-)
+@pytest.mark.parametrize(("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default")])
 def test_every_entry_trains(name: str, env: str, tmp_path: Path) -> None:
     try:
         rl_zoo3.utils.gym.make(env).close()
