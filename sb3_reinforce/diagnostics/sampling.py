@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.reinforce import REINFORCE
@@ -118,7 +119,8 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     try:
         if normalize is not None:
             normalize.training = False
-        yield
+        with guard(env):
+            yield
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     except Exception:

@@ -1,7 +1,5 @@
 """FiniteDifference as an algorithm of Stable-Baselines3: counts, callbacks, going on, and what may go wrong."""
 
-import os
-import threading
 import warnings
 from collections import deque
 from functools import partial
@@ -25,7 +23,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.estimation.estimators import central_difference
@@ -377,87 +375,6 @@ def test_what_a_user_returns_wrongly_is_named_and_theta_stays(kwargs: dict[str, 
     with pytest.raises(ValueError, match=match):
         model.learn(100)
     assert th.equal(model.theta, theta) and model._n_updates == 0
-
-
-class Failing(gym.Wrapper):
-    """Goes wrong in the given way at its 100th step."""
-
-    def __init__(self, env: gym.Env, how: str):
-        super().__init__(env)
-        self.how, self.steps = how, 0
-
-    def step(self, action: Any) -> Any:
-        obs, reward, *rest = super().step(action)
-        self.steps += 1
-        if self.steps == 100:
-            if self.how == "interrupt":
-                raise KeyboardInterrupt
-            if self.how == "exception":
-                raise RuntimeError("the simulator broke")
-            return obs, np.nan, *rest
-        return obs, reward, *rest
-
-
-@pytest.mark.parametrize(
-    ("how", "error"), [("interrupt", KeyboardInterrupt), ("exception", RuntimeError), ("nan", ValueError)]
-)
-def test_theta_is_the_last_good_one_after_a_failure_and_can_be_saved(
-    how: str, error: type[BaseException], tmp_path: Any
-) -> None:
-    env = VecNormalize(make_vec_env("CartPole-v1", 1, wrapper_class=Failing, wrapper_kwargs=dict(how=how)))
-    model = make(env)
-    callback = Recorder()
-    with pytest.raises(error):
-        model.learn(10_000, callback)
-    assert th.equal(model.theta, callback.centre) and env.training
-    model.save(tmp_path / "model")
-    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, callback.centre)
-    assert model.learn(200).num_timesteps >= 200
-
-
-class Dying(gym.Wrapper):
-    """Ends its process in the middle of its 20th step."""
-
-    steps = 0
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        if self.steps == 20:
-            os._exit(1)
-        return super().step(action)
-
-
-@pytest.mark.parametrize("in_a_step", [True, False])
-@pytest.mark.parametrize("dead", [0, 1])
-@pytest.mark.parametrize("start_method", ["forkserver", "fork"])
-def test_a_dead_worker_ends_training_promptly(start_method: str, dead: int, in_a_step: bool, tmp_path: Any) -> None:
-    env_fns = [lambda: gym.make("CartPole-v1")] * 2
-    if in_a_step:
-        env_fns[dead] = lambda: Dying(gym.make("CartPole-v1"))
-    with warnings.catch_warnings():
-        # Python warns of fork beside threads; here it is what is tested
-        warnings.simplefilter("ignore", DeprecationWarning)
-        env = SubprocVecEnv(env_fns, start_method=start_method)
-    model = make(env)
-
-    class Kill(BaseCallback):
-        def _on_step(self) -> bool:
-            if self.n_calls == 20:
-                env.processes[dead].kill()
-                env.processes[dead].join()
-            return True
-
-    # Were it to hang, this would end the wait, with an error of another kind
-    watchdog = threading.Timer(60, env.processes[1 - dead].kill)
-    watchdog.start()
-    with pytest.raises(ConnectionError, match=f"worker of environment {dead} died"):
-        model.learn(10_000, Kill())
-    assert watchdog.is_alive()
-    watchdog.cancel()
-    model.save(tmp_path / "model")
-    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, model.theta)
-    env.processes[1 - dead].kill()
-    env.closed = True
 
 
 def test_policy_kwargs_are_not_written_to() -> None:
