@@ -18,8 +18,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, VmapActor, actor_class, make_actor, mode
-from sb3_reinforce.sampling.candidates import Step, evaluate, queues, start
+from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor, mode
+from sb3_reinforce.sampling.candidates import (
+    CandidateStep,
+    evaluate_candidates,
+    schedule_episodes,
+    start_episodes,
+)
 
 BOX = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
@@ -41,13 +46,13 @@ class OwnPrediction(ActorCriticPolicy):
 POLICIES = [
     (LinearPolicy, BOX, {}, MatrixActor),
     (ActorCriticPolicy, BOX, {}, MatrixActor),
-    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), VmapActor),
+    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), LoopActor),
     (ActorCriticPolicy, spaces.Discrete(5), {}, MatrixActor),
     (ActorCriticPolicy, spaces.Box(-1, 1, (2, 3)), dict(share_features_extractor=False), MatrixActor),
-    (ActorCriticCnnPolicy, IMAGE, {}, VmapActor),
-    (ActorCriticCnnPolicy, IMAGE, dict(share_features_extractor=False, net_arch=[5]), VmapActor),
+    (ActorCriticCnnPolicy, IMAGE, {}, LoopActor),
+    (ActorCriticCnnPolicy, IMAGE, dict(share_features_extractor=False, net_arch=[5]), LoopActor),
     (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": spaces.Discrete(2)}), {}, MatrixActor),
-    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": IMAGE}), {}, VmapActor),
+    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": IMAGE}), {}, LoopActor),
     (OwnPrediction, BOX, {}, LoopActor),
     (ActorCriticPolicy, BOX, dict(use_sde=True, squash_output=True), LoopActor),
 ]
@@ -85,10 +90,10 @@ def test_side_by_side_is_one_by_one(
         pytest.skip("gSDE is for Box actions")
     th.manual_seed(0)
     policy = policy_class(obs_space, actions, lambda _: 1e-3, **kwargs)
-    assert actor_class(policy) is expected
     actor, thetas = perturbed(policy, K)
     obs, before = sample(obs_space, K), parameters.read(actor)
-    together = make_actor(policy, actor, K, deterministic=True)
+    together = make_candidate_actor(policy, actor, K, deterministic=True)
+    assert type(together) is expected
     # In two parts, and the first part twice, as environments are refilled
     together.assign([0, 2], thetas[[1, 2]])
     together.assign([0, 1, 3], thetas[[0, 1, 3]])
@@ -118,7 +123,7 @@ def test_stochastic_candidates_sample_the_policy(actions: spaces.Space) -> None:
     n = 4000
     policy = ActorCriticPolicy(BOX, actions, lambda _: 1e-3)
     actor, thetas = perturbed(policy, 1)
-    together = make_actor(policy, actor, n, deterministic=False)
+    together = make_candidate_actor(policy, actor, n, deterministic=False)
     together.assign(range(n), thetas.expand(n, -1))
     obs = sample(BOX, 1).repeat(n, axis=0)
     drawn = together.act(obs).reshape(n, -1).astype(float)
@@ -157,7 +162,7 @@ def lengths_policy(lengths: list[int]) -> tuple[ActorCriticPolicy, list[th.nn.Pa
     )
 
 
-def record(steps: list[Step]) -> Any:
+def record(steps: list[CandidateStep]) -> Any:
     return steps.append
 
 
@@ -168,7 +173,9 @@ def test_every_candidate_has_exactly_its_episodes(n_envs: int, seeded: bool) -> 
     policy, actor, thetas = lengths_policy(lengths)
     env, steps = make_vec_env(Counting, n_envs), []
     seeds = np.arange(10).reshape(5, 2) if seeded else None
-    returns = evaluate(make_actor(policy, actor, n_envs, True), env, thetas, seeds, n_episodes, 100, record(steps))
+    returns = evaluate_candidates(
+        make_candidate_actor(policy, actor, n_envs, True), env, thetas, seeds, n_episodes, 100, record(steps)
+    )
     np.testing.assert_array_equal(returns, np.repeat(np.array(lengths)[:, None], 2, axis=1))
     ended = Counter(step.infos[i]["episode"]["l"] for step in steps for i in np.flatnonzero(step.finished))
     assert ended == Counter(lengths * n_episodes)
@@ -176,16 +183,18 @@ def test_every_candidate_has_exactly_its_episodes(n_envs: int, seeded: bool) -> 
 
 def test_a_queue_without_rounds_leaves_no_environment_idle_while_it_lasts() -> None:
     policy, actor, thetas = lengths_policy([9] + [3] * 6)
-    steps: list[Step] = []
-    evaluate(make_actor(policy, actor, 3, True), make_vec_env(Counting, 3), thetas, None, 1, 100, record(steps))
+    steps: list[CandidateStep] = []
+    evaluate_candidates(
+        make_candidate_actor(policy, actor, 3, True), make_vec_env(Counting, 3), thetas, None, 1, 100, record(steps)
+    )
     # 27 steps of candidates in three environments
     assert len(steps) == 9
 
 
 def test_rounds_and_queue_hold_every_pair_once() -> None:
     pairs = [(candidate, episode) for episode in range(2) for candidate in range(5)]
-    assert queues(5, 2, 4, in_rounds=False) == [pairs]
-    rounds = queues(5, 2, 4, in_rounds=True)
+    assert schedule_episodes(5, 2, 4, in_rounds=False) == [pairs]
+    rounds = schedule_episodes(5, 2, 4, in_rounds=True)
     assert [pair for queue in rounds for pair in queue] == pairs and max(map(len, rounds)) == 4
 
 
@@ -207,10 +216,10 @@ def test_equal_seeds_are_equal_starts_in_every_environment_and_at_every_time(nam
     if isinstance(env, VecNormalize):
         env.training = False
     seeds = np.array([[11], [11], [12], [12], [11], [13]])
-    first = start(env, [(0, 0), (1, 0), (2, 0)], seeds)
+    first = start_episodes(env, [(0, 0), (1, 0), (2, 0)], seeds)
     for _ in range(5):
         env.step(np.zeros((3, 1), dtype=np.float32))
-    second = start(env, [(3, 0), (4, 0), (5, 0)], seeds)
+    second = start_episodes(env, [(3, 0), (4, 0), (5, 0)], seeds)
     env.close()
     assert np.array_equal(first[0], first[1]) and np.array_equal(first[0], second[1])
     assert np.array_equal(first[2], second[0])
@@ -229,7 +238,7 @@ def test_a_number_that_is_not_finite_is_named(what: str) -> None:
     policy, actor, thetas = lengths_policy([2, 3, 1, 7])
     env = make_vec_env(Broken, 2)
     with pytest.raises(ValueError, match=f"The {what} of candidate 3, episode 0, step 3 .* is not finite"):
-        evaluate(make_actor(policy, actor, 2, True), env, thetas, None, 1, 100, record([]))
+        evaluate_candidates(make_candidate_actor(policy, actor, 2, True), env, thetas, None, 1, 100, record([]))
 
 
 def test_large_finite_numbers_are_no_error() -> None:
@@ -239,7 +248,9 @@ def test_large_finite_numbers_are_no_error() -> None:
             return obs, 1e30, *rest
 
     policy, actor, thetas = lengths_policy([2])
-    returns = evaluate(make_actor(policy, actor, 1, True), make_vec_env(Large, 1), thetas, None, 1, 100, record([]))
+    returns = evaluate_candidates(
+        make_candidate_actor(policy, actor, 1, True), make_vec_env(Large, 1), thetas, None, 1, 100, record([])
+    )
     assert returns[0, 0] == pytest.approx(2e30)
 
 
@@ -249,8 +260,8 @@ def test_an_episode_that_does_not_end_is_named(seeded: bool) -> None:
     seeds = np.zeros((3, 1), dtype=int) if seeded else None
     env = make_vec_env(Counting, 2)
     with pytest.raises(ValueError, match=r"max_episode_steps=8 steps .candidate 2, episode 0"):
-        evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 8, record([]))
-    evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 9, record([]))
+        evaluate_candidates(make_candidate_actor(policy, actor, 2, True), env, thetas, seeds, 1, 8, record([]))
+    evaluate_candidates(make_candidate_actor(policy, actor, 2, True), env, thetas, seeds, 1, 9, record([]))
 
 
 def test_a_vec_env_that_cannot_seed_its_environments_is_an_error() -> None:
@@ -259,4 +270,4 @@ def test_a_vec_env_that_cannot_seed_its_environments_is_an_error() -> None:
             raise NotImplementedError
 
     with pytest.raises(ValueError, match="set common_random_numbers=False"):
-        start(Unseedable([Counting]), [(0, 0)], np.zeros((1, 1), dtype=int))
+        start_episodes(Unseedable([Counting]), [(0, 0)], np.zeros((1, 1), dtype=int))
