@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation.rollout import Extent
 from sb3_reinforce.estimation.weights import Running, weigh
-from sb3_reinforce.sampling.collection import Ends
+from sb3_reinforce.sampling.collection import Extent
 
 GAMMA = 0.5
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)

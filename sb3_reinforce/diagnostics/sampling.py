@@ -53,8 +53,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     sampler, _ = sampled(model, n_episodes, baseline)
-    assert sampler._rollout is not None
-    return sampler._rollout
+    assert sampler.rollout is not None
+    return sampler.rollout
 
 
 def sampled(
@@ -156,4 +156,4 @@ def training_weights(model: REINFORCE) -> th.Tensor:
     :param model: A model that has collected a rollout
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    return th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)).double()
+    return th.as_tensor(by_step(model.rollout_buffer)[0]).double()

@@ -9,7 +9,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions, zeros
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, reached
+from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -21,7 +21,7 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
     training = policy.training
     policy.set_training_mode(False)
-    in_actor = reached(log_prob_and_entropy(policy, obs, actions)[0], trainable)
+    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], trainable)
     with th.no_grad():
         # A policy keeps its last distribution, and with the graph in it could not be deep-copied
         log_prob_and_entropy(policy, obs, actions)
