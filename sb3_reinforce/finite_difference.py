@@ -1,7 +1,6 @@
 """FiniteDifference as an algorithm of Stable-Baselines3."""
 
 import warnings
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -31,7 +30,7 @@ from sb3_reinforce.common.search_settings import (
 )
 from sb3_reinforce.common.spaces import check_env
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.estimation.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
+from sb3_reinforce.estimation.estimators import ESTIMATORS, Estimator, GradientEstimate, central_difference, fit_quality
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, new_generator
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
@@ -41,25 +40,6 @@ from sb3_reinforce.sampling.normalization import frozen
 from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
-
-
-@dataclass(frozen=True)
-class GradientEstimate:
-    """
-    A gradient of the utility, and the evaluations that it was estimated from.
-
-    :param gradient: ĝ ≈ ∇U(θ), shape ``(n,)``, float64
-    :param candidates: All parameter vectors that were evaluated, shape ``(m, n)``, float64
-    :param utilities: Their mean returns, shape ``(m,)``, float64
-    :param delta_std: The scale of the perturbations
-    :param parameters: The parameters of the policy that θ consists of, with n elements in all
-    """
-
-    gradient: th.Tensor
-    candidates: th.Tensor
-    utilities: th.Tensor
-    delta_std: float
-    parameters: list[th.nn.Parameter]
 
 
 class FiniteDifference(Persistent):
@@ -198,11 +178,7 @@ class FiniteDifference(Persistent):
             self._generator = new_generator()
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """
-        Seed the global generators, the environments and the perturbations.
-
-        :param seed: The seed; None changes nothing
-        """
+        """Seed the global generators, the environments and the perturbations; None changes nothing."""
         super().set_random_seed(seed)
         if seed is not None:
             self._generator = new_generator()
@@ -299,17 +275,25 @@ class FiniteDifference(Persistent):
             callback.on_rollout_start()
             searched = self._find_parameters()
             theta = parameters.read(searched)
-            delta_std = self._current_delta_std(theta)
-            deltas = delta_std * self._sample_directions(len(theta))
+            delta_std = (
+                default_delta_std(theta)
+                if self.delta_std is None
+                else self.delta_std_schedule(self._current_progress_remaining)
+            )
+            n = len(theta)
+            n_delta = cast(int, self.n_delta)
+            generator = cast(th.Generator, self._generator)
+            perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
+            deltas = delta_std * check_deltas(perturbation(n_delta, n, generator), n_delta, n)
             estimator = check_function("estimator", self.estimator, ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)
-            first_seed = int(th.randint(2**31, (), generator=self._generator))
+            first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
             actor = make_candidate_actor(self.policy, searched, self.n_envs, self.deterministic)
             with frozen(self.get_vec_normalize_env()) as observed:
-                utility = EpisodicUtility(self, actor, len(theta), callback, observed, first_seed)
-                gradient = check_gradient(estimator(utility, theta, deltas), len(theta))
+                utility = EpisodicUtility(self, actor, n, callback, observed, first_seed)
+                gradient = check_gradient(estimator(utility, theta, deltas), n)
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:
@@ -319,18 +303,6 @@ class FiniteDifference(Persistent):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return GradientEstimate(gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched)
-
-    def _current_delta_std(self, theta: th.Tensor) -> float:
-        """The scale of the perturbations at this point of the training."""
-        if self.delta_std is None:
-            return default_delta_std(theta)
-        return self.delta_std_schedule(self._current_progress_remaining)
-
-    def _sample_directions(self, n_parameters: int) -> th.Tensor:
-        """The perturbations before they are scaled, shape ``(n_delta, n)``."""
-        perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
-        n_delta = cast(int, self.n_delta)
-        return check_deltas(perturbation(n_delta, n_parameters, self._generator), n_delta, n_parameters)
 
     @uninterrupted
     def train(self, estimate: GradientEstimate) -> None:

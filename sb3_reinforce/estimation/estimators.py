@@ -90,6 +90,25 @@ def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
 
 
 @dataclass(frozen=True)
+class GradientEstimate:
+    """
+    A gradient of the utility, and the evaluations that it was estimated from.
+
+    :param gradient: ĝ ≈ ∇U(θ), shape ``(n,)``, float64
+    :param candidates: All parameter vectors that were evaluated, shape ``(m, n)``, float64
+    :param utilities: Their mean returns, shape ``(m,)``, float64
+    :param delta_std: The scale of the perturbations
+    :param parameters: The parameters of the policy that θ consists of, with n elements in all
+    """
+
+    gradient: th.Tensor
+    candidates: th.Tensor
+    utilities: th.Tensor
+    delta_std: float
+    parameters: list[th.nn.Parameter]
+
+
+@dataclass(frozen=True)
 class Fit:
     """
     How well a gradient explains the utilities that it was estimated from.

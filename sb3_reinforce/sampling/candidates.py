@@ -37,7 +37,7 @@ class CandidateStep:
 
 
 class EpisodeTracker:
-    """The pair that each environment runs, and its return so far; a step that ends no episode costs next to nothing."""
+    """The pair that each environment runs and its return so far, at next to no cost for steps that end no episode."""
 
     def __init__(self, queue: list[Pair], n_envs: int, max_episode_steps: int):
         self.pairs = queue[:n_envs]

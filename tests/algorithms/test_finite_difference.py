@@ -26,8 +26,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimation.estimators import central_difference
-from sb3_reinforce.finite_difference import GradientEstimate
+from sb3_reinforce.estimation.estimators import GradientEstimate, central_difference
 
 SMALL: dict[str, Any] = dict(n_delta=3, estimator="central", seed=0, device="cpu")
 
