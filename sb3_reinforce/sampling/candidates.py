@@ -117,6 +117,9 @@ def evaluate_candidates(
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))
     step = stepper(env)
+    if seeds is not None:
+        # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
+        env.reset()
     for queue in schedule_episodes(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         tracker = EpisodeTracker(queue, env.num_envs, max_episode_steps)
         obs = start_episodes(env, tracker.pairs, seeds)
