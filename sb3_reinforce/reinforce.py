@@ -1,7 +1,6 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
 import copy
-import math
 from collections import deque
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -18,26 +17,18 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import explained_variance, obs_as_tensor, update_learning_rate
+from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_flag, check_function
-from sb3_reinforce.common.base import Persistent
-from sb3_reinforce.common.common_settings import check_basics, check_learn
-from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.prediction import predict
-from sb3_reinforce.common.settings import check_reinforce
-from sb3_reinforce.common.spaces import check_env
+from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
+from sb3_reinforce.common.settings import REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
-from sb3_reinforce.estimation.returns import Bools
-from sb3_reinforce.estimation.rollout import Running, in_finished_episode, timesteps_of, within_quota
-from sb3_reinforce.estimation.weights import Batch, check_used, compute_advantages, compute_returns, training_batch
+from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
 from sb3_reinforce.policies.evaluation import (
-    MAX_TEMPERATURE,
     Parameters,
     Route,
     evaluate,
@@ -46,19 +37,12 @@ from sb3_reinforce.policies.evaluation import (
     set_temperature,
     split_parameters,
 )
-from sb3_reinforce.sampling.collection import (
-    Extent,
-    TerminalObs,
-    by_step,
-    check_rollout_data,
-    collect,
-    warn_of_own_methods,
-)
+from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
 
-class REINFORCE(Persistent, OnPolicyAlgorithm):
+class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
@@ -132,7 +116,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
-    predict = predict
+    _arguments = REINFORCE_ARGUMENTS
 
     def __init__(
         self,
@@ -169,27 +153,24 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
-        check_flag("use_sde", use_sde)
-        if env is not None or _init_setup_model:
-            env = check_env(env, verbose)
         super().__init__(
             policy,
             env,
+            needs_env=_init_setup_model,
             learning_rate=learning_rate,
-            n_steps=n_steps,  # type: ignore[arg-type]
+            n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
-            ent_coef=ent_coef,  # type: ignore[arg-type]
+            ent_coef=ent_coef,
             vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             rollout_buffer_class=rollout_buffer_class,
             rollout_buffer_kwargs=rollout_buffer_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=None if policy_kwargs is None else dict(policy_kwargs),
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
@@ -217,20 +198,14 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
     @property
     def has_critic(self) -> bool:
         """Whether a critic is trained and used."""
-        return check_function("baseline", self.baseline, BASELINES) is BASELINES["value"]
-
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate, high=MAX_LEARNING_RATE)
-
-    def _scheduled(self, name: str, above: bool = False, high: float = math.inf) -> float:
-        return CheckedSchedule(name, getattr(self, name), above=above, high=high)(self._current_progress_remaining)
+        return self._function("baseline", BASELINES) is BASELINES["value"]
 
     def _critic_rate(self) -> float:
         name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
-        return self._scheduled(name, high=MAX_LEARNING_RATE)
+        return self._scheduled(name)
 
     def _setup_model(self) -> None:
-        check_reinforce(self)
+        check_reinforce(self, BASELINES)
         # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout resizes it
         n_steps = self.n_steps
         self.n_steps = n_steps or 1
@@ -267,12 +242,8 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         return groups
 
     def _apply_temperature_and_floor(self) -> None:
-        set_temperature(self.policy, self._scheduled("temperature", above=True, high=MAX_TEMPERATURE))
+        set_temperature(self.policy, self._scheduled("temperature"))
         floor_std(self.policy, self.min_std)
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # A last rollout that overshoots total_timesteps must not train at a negative rate
-        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
@@ -314,7 +285,26 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
                 return False
             dones, terminal_obs = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
-            self.rollout = self._complete(rollout_buffer, route, dones, terminal_obs, extent)
+            next_values = None
+            if route.with_critic:
+                rollout_buffer.values = values_along(self.policy, route, rollout_buffer)
+                next_values = values_after(
+                    self.policy, route, rollout_buffer.values, dones, self._last_obs, terminal_obs
+                )
+            self.rollout = complete_rollout(
+                rollout_buffer,
+                self.policy,
+                dones,
+                None if n_rollout_steps else extent.quota,
+                self._running,
+                next_values,
+                baseline=self._function("baseline", BASELINES),
+                gamma=self.gamma,
+                gae_lambda=self.gae_lambda,
+                reward_to_go=self.reward_to_go,
+                discount_scores=self.discount_scores,
+                normalize_by=self.normalize_by,
+            )
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
             check_rollout_data(rollout_buffer, self._last_obs, {})
@@ -331,45 +321,6 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
-
-    def _complete(
-        self, buffer: RolloutBuffer, route: Route, dones: Bools, terminal_obs: TerminalObs, extent: Extent
-    ) -> Rollout:
-        """Compute m_t, G_t, b_t and D of what was collected, and write ``(G_t − b_t)`` and G_t into the buffer."""
-        is_fixed = np.isfinite(extent.n_steps)
-        timesteps = timesteps_of(dones, self._running.timesteps)
-        # m_t = 1 where G_t is known
-        used = within_quota(dones, extent.quota) & (route.with_critic | in_finished_episode(dones))
-        check_used(used, self.n_steps if is_fixed else None)
-        next_values: Any = 0.0
-        if route.with_critic:
-            buffer.values = values_along(self.policy, route, buffer)
-            next_values = values_after(self.policy, route, buffer.values, dones, self._last_obs, terminal_obs)
-        returns, returns_to_go = compute_returns(
-            buffer.rewards, dones, next_values, timesteps, self._running, self.gamma, self.gae_lambda, self.reward_to_go
-        )
-        # γ^t is in the total return already
-        exponents = timesteps * (self.discount_scores and self.reward_to_go)
-        denominator = used.size if is_fixed else cast(int, self.n_episodes)
-        if not is_fixed and self.normalize_by == "steps":
-            denominator = int(used.sum())
-        rollout = Rollout(
-            observations=obs_as_tensor(buffer.observations, self.device),
-            actions=th.as_tensor(buffer.actions, device=self.device),
-            rewards=th.as_tensor(buffer.rewards).double(),
-            dones=th.as_tensor(dones),
-            timesteps=th.as_tensor(timesteps),
-            used=th.as_tensor(used),
-            returns=th.tensor(returns),
-            discounts=th.as_tensor(self.gamma**exponents),
-            values=th.as_tensor(buffer.values).double() if route.with_critic else None,
-            policy=self.policy,
-            denominator=denominator,
-        )
-        baseline = check_function("baseline", self.baseline, BASELINES)
-        buffer.advantages = compute_advantages(rollout, baseline(rollout))
-        buffer.returns = ((returns_to_go if route.with_critic else returns) * used).astype(np.float32)
-        return rollout
 
     @uninterrupted
     def train(self) -> None:

@@ -1,34 +1,74 @@
 """From rewards to the weights γ^t (G_t − b_t) of the scores, as functions of arrays."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
-from sb3_reinforce.estimation.rollout import Rollout, Running
+from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
 
-def compute_returns(
-    rewards: Floats,
+def complete_rollout(
+    buffer: RolloutBuffer,
+    policy: ActorCriticPolicy,
     dones: Bools,
-    next_values: Floats | float,
-    timesteps: Integers,
+    quota: Integers | None,
     running: Running,
+    next_values: Floats | None,
+    *,
+    baseline: Callable[[Rollout], th.Tensor],
     gamma: float,
     gae_lambda: float,
     reward_to_go: bool,
-) -> tuple[Floats, Floats]:
-    """G_t that weights the scores, and the λ-return that a critic is fitted to, both ``(n_steps, n_envs)``."""
-    returns_to_go = lambda_return(rewards, dones, next_values, gamma, gae_lambda)
-    if reward_to_go:
-        return returns_to_go, returns_to_go
-    return total_return(returns_to_go, timesteps, gamma, running.rewards), returns_to_go
+    discount_scores: bool,
+    normalize_by: str,
+) -> Rollout:
+    """
+    m_t, G_t, γ^t and D of what was collected; ``G_t − b_t`` and what a critic is fitted to are written to the buffer.
+
+    ``quota`` is None for a fixed number of steps, and ``next_values`` None without a critic.
+    """
+    rewards = buffer.rewards
+    timesteps = timesteps_of(dones, running.timesteps)
+    # m_t = 1 where G_t is known
+    used = np.ones_like(dones) if next_values is not None else in_finished_episode(dones)
+    if quota is not None:
+        used = used & within_quota(dones, quota)
+    check_used(used, None if quota is not None else len(dones))
+    returns_to_go = lambda_return(rewards, dones, 0.0 if next_values is None else next_values, gamma, gae_lambda)
+    returns = returns_to_go if reward_to_go else total_return(returns_to_go, timesteps, gamma, running.rewards)
+    # The total return has γ^t already
+    exponents = timesteps * (discount_scores and reward_to_go)
+    if quota is None:
+        denominator = used.size
+    else:
+        denominator = int(used.sum() if normalize_by == "steps" else quota.sum())
+    rollout = Rollout(
+        observations=obs_as_tensor(buffer.observations, policy.device),
+        actions=th.as_tensor(buffer.actions, device=policy.device),
+        rewards=th.as_tensor(rewards).double(),
+        dones=th.as_tensor(dones),
+        timesteps=th.as_tensor(timesteps),
+        used=th.as_tensor(used),
+        returns=th.tensor(returns),
+        discounts=th.as_tensor(gamma**exponents),
+        values=None if next_values is None else th.as_tensor(buffer.values).double(),
+        policy=policy,
+        denominator=denominator,
+    )
+    buffer.advantages = compute_advantages(rollout, baseline(rollout))
+    buffer.returns = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
+    return rollout
 
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:

@@ -26,8 +26,8 @@ from sb3_reinforce.policies.plain_mlp import (
 
 Parameters: TypeAlias = list[nn.Parameter]
 
-# Logits of float32 networks leave one action at the first temperature, and prefer none at the second
-MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e6
+# At this temperature the logits of float32 networks leave one action
+MIN_TEMPERATURE = 1e-3
 
 
 @dataclass(frozen=True)

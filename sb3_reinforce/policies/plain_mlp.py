@@ -77,7 +77,9 @@ def methods_of(cls: Any) -> frozenset[str]:
 
 @lru_cache
 def own_methods(cls: type, base: type) -> frozenset[str]:
-    """The methods of ``base`` that a subclass overrides."""
+    """The methods of ``base`` that a class overrides; all of them if it is no subclass, as a compiled policy."""
+    if base not in cls.__mro__:
+        return methods_of(base)
     subclasses = cls.__mro__[: cls.__mro__.index(base)]
     return methods_of(base) & {name for subclass in subclasses for name in vars(subclass)}
 

@@ -17,8 +17,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_reinforce.envs.checks import all_finite, is_finite, told
-from sb3_reinforce.envs.stepping import stepper
+from sb3_reinforce.envs.checks import all_finite, format_number, is_finite
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
@@ -78,7 +77,7 @@ class EpisodeTracker:
         bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
         if bad.any():
             env = int(bad.argmax())
-            raise ValueError(f"{name} of {self.describe(env)} is not finite: {told(values[env])}. {UNCHANGED}")
+            raise ValueError(f"{name} of {self.describe(env)} is not finite: {format_number(values[env])}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """Write the finished episodes to ``returns[candidate, episode]``, and list the environments with new pairs."""
@@ -116,7 +115,6 @@ def evaluate_candidates(
     """The returns Σ_t r_t, unscaled, of candidates ``(m, n)`` from seeds ``(m, n_episodes)``, in the seeds' shape."""
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))
-    step = stepper(env)
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
         env.reset()
@@ -129,7 +127,7 @@ def evaluate_candidates(
             if started:
                 actor.assign(started, thetas[[tracker.pairs[i][0] for i in started]])
                 started = []
-            obs, rewards, dones, infos = step(actor.act(obs))
+            obs, rewards, dones, infos = env.step(actor.act(obs))
             tracker.add(rewards if original is None else original(), obs)
             finished = dones & tracker.active
             on_step(CandidateStep(obs, rewards, dones, infos, finished))

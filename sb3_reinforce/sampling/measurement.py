@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
+from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -23,7 +24,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     env = cast(VecEnv, model.env)
     # Whatever ends the block, a model without an observation resets its environments before it goes on
     model._last_obs = None
-    with interruptible(), frozen(model.get_vec_normalize_env()):
+    with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
         yield
         obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
