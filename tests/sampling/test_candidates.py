@@ -133,7 +133,7 @@ def shift(*inputs: Any) -> th.Tensor:
 def replace(thing: Any, name: str, change: Callable[[th.Tensor], th.Tensor]) -> None:
     """Put a function that refers to the old method in its place."""
     old = getattr(thing, name)
-    setattr(thing, name, lambda x, *args, **kwargs: old(change(x), *args, **kwargs))
+    setattr(thing, name, lambda *args, **kwargs: old(change(*args[:1], *kwargs.values()), *args[1:]))
 
 
 # What a user may do to a policy to change how it acts
@@ -164,7 +164,7 @@ def test_an_error_in_prediction_leaves_the_policy_as_it_was() -> None:
     before = parameters.read(actor)
     together = make_candidate_actor(policy, actor, K, deterministic=True)
     together.assign(range(K), thetas)
-    with pytest.raises(RuntimeError):
+    with pytest.raises(ValueError, match="Unexpected observation shape"):
         together.act(np.zeros((K, 5), dtype=np.float32))
     assert th.equal(parameters.read(actor), before)
 
@@ -225,9 +225,11 @@ def evaluate(
     max_episode_steps: int = 100,
 ) -> tuple[np.ndarray, list[CandidateStep]]:
     """The returns and steps of linear policies, of which candidate i ends its episodes after ``lengths[i]`` steps."""
-    policy = LinearPolicy(Counting.observation_space, Counting.action_space, lambda _: 1e-3)
+    policy = LinearPolicy(env.observation_space, Counting.action_space, lambda _: 1e-3)
     actor = make_candidate_actor(policy, parameters.actor_parameters(policy), env.num_envs, True)
-    thetas = th.tensor([[0.0, (length - 1) / 10] for length in lengths]).double()
+    # The last observation is 1
+    thetas = th.zeros(len(lengths), *env.observation_space.shape).double()
+    thetas[:, -1] = (th.tensor(lengths) - 1) / 10
     steps: list[CandidateStep] = []
     return evaluate_candidates(actor, env, thetas, seeds, n_episodes, max_episode_steps, steps.append), steps
 
