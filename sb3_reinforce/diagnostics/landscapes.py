@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.diagnostics.sampling import check_env, seeded, undisturbed
 from sb3_reinforce.policies import parameters
-from sb3_reinforce.sampling.candidate_actors import make_actor
-from sb3_reinforce.sampling.candidates import Step, evaluate
+from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
+from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
 
 
 class CandidateUtility:
@@ -39,11 +39,9 @@ class CandidateUtility:
         self.model, self.n_episodes = model, check_integer("n_episodes", n_episodes, 1)
         self.seed, self.n_steps = check_integer("seed", seed, 0), 0
         policy = cast(ActorCriticPolicy, model.policy)
-        training = policy.training
         self.parameters = parameters.actor_parameters(policy)
-        policy.set_training_mode(training)
         self.theta = parameters.read(self.parameters)
-        self.actor = make_actor(policy, self.parameters, n_envs, deterministic=False)
+        self.actor = make_candidate_actor(policy, self.parameters, n_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:
         """
@@ -59,10 +57,12 @@ class CandidateUtility:
         env, normalize = cast(VecEnv, self.model.env), self.model.get_vec_normalize_env()
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)
-            returns = evaluate(self.actor, env, candidates, seeds, self.n_episodes, limit, self.count, normalize)
+            returns = evaluate_candidates(
+                self.actor, env, candidates, seeds, self.n_episodes, limit, self.count, normalize
+            )
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
-    def count(self, step: Step) -> None:
+    def count(self, step: CandidateStep) -> None:
         """
         Count the steps of all environments, those of idle ones too.
 

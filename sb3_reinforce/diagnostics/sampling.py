@@ -4,7 +4,7 @@ import copy
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -15,11 +15,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.collection import by_step
+from sb3_reinforce.sampling.measurement import undisturbed as undisturbed
 
 AnyREINFORCE = TypeVar("AnyREINFORCE", bound=REINFORCE)
 
@@ -53,8 +53,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     sampler, _ = sampled(model, n_episodes, baseline)
-    assert sampler._rollout is not None
-    return sampler._rollout
+    assert sampler.rollout is not None
+    return sampler.rollout
 
 
 def sampled(
@@ -107,30 +107,6 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
             policy.set_training_mode(training)
 
 
-@contextmanager
-def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
-    """
-    Use a model's environments in the block; the statistics of a VecNormalize stay as they are.
-
-    :param model: The model; in the middle of training too, it then goes on from the start of an episode
-    """
-    env, normalize = cast(VecEnv, model.env), model.get_vec_normalize_env()
-    training = normalize is not None and normalize.training
-    try:
-        if normalize is not None:
-            normalize.training = False
-        with guard(env):
-            yield
-        model._last_obs = env.reset()  # type: ignore[assignment]
-        model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-    except Exception:
-        model._last_obs = None
-        raise
-    finally:
-        if normalize is not None:
-            normalize.training = training
-
-
 def check_model(model: Any) -> VecEnv:
     """
     Check that a model can be measured.
@@ -180,4 +156,4 @@ def training_weights(model: REINFORCE) -> th.Tensor:
     :param model: A model that has collected a rollout
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    return th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)).double()
+    return th.as_tensor(by_step(model.rollout_buffer)[0]).double()

@@ -23,12 +23,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimation.estimators import central_difference
+from sb3_reinforce.estimation.estimators import GradientEstimate, central_difference
 
-LINEAR = ("LinearPolicy", "CartPole-v1")
 SMALL: dict[str, Any] = dict(n_delta=3, estimator="central", seed=0, device="cpu")
 
 
@@ -71,27 +70,25 @@ class Recorder(BaseCallback):
         return self.stop_at is None or self.n_calls < self.stop_at
 
 
+def estimates(n_updates: int, **kwargs: Any) -> list[GradientEstimate]:
+    """Of as many updates on ``Line`` at one θ."""
+    model, callback = make(Line(), learning_rate=0.0, delta_std=0.1, **kwargs), Recorder()
+    model.learn(1, callback)
+    return [model.estimate_gradient(callback) for _ in range(n_updates)]
+
+
 def test_the_gradient_is_the_estimator_applied_to_the_utility() -> None:
-    model = make(Line(), perturbation="gaussian", delta_std=0.1, n_delta=4, standardize_utilities=False)
-    model._setup_learn(1)
-    model._prepare_search()
-    gradient = model.estimate_gradient(Recorder_initialised(model))
-    starts = th.cat(model._utility.candidates)
+    (estimate,) = estimates(1, n_delta=4)
+    theta = estimate.candidates.mean()
     # In Line with W = w, U = −(w s − 3 s)² = −(w − 3)² s² for the start s of the column
-    utilities = th.cat(model._utility.values).reshape(2, 4)
-    candidates = starts.reshape(2, 4)
+    utilities, candidates = estimate.utilities.reshape(2, 4), estimate.candidates.reshape(2, 4)
     s_squared = -utilities / (candidates - 3) ** 2
     th.testing.assert_close(s_squared[0], s_squared[1], rtol=1e-4, atol=1e-6)
     assert len(s_squared[0].unique()) == 4
-    theta, deltas = model.theta, candidates[0] - model.theta
-    expected = central_difference(lambda x: -((x[..., 0] - 3) ** 2) * s_squared[0], theta, deltas[:, None])
-    th.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-4)
-
-
-def Recorder_initialised(model: FiniteDifference) -> Recorder:
-    callback = Recorder()
-    callback.init_callback(model)
-    return callback
+    deltas = candidates[0] - theta
+    expected = central_difference(lambda x: -((x[..., 0] - 3) ** 2) * s_squared[0], theta[None], deltas[:, None])
+    th.testing.assert_close(estimate.gradient, expected, rtol=1e-3, atol=1e-4)
+    assert float(deltas.std()) < 3 * estimate.delta_std
 
 
 @pytest.mark.parametrize("estimator", ["regression", "central", "forward"])
@@ -184,22 +181,9 @@ def test_the_log() -> None:
     assert isinstance(model.ep_info_buffer, deque) and model.ep_info_buffer.maxlen == 100
 
 
-def test_the_same_seed_is_the_same_parameters() -> None:
-    first, again, other = (make(make_vec_env("CartPole-v1", 3), seed=seed).learn(500).theta for seed in (0, 0, 1))
-    assert th.equal(first, again)
+def test_another_seed_is_another_search() -> None:
+    first, other = (make(seed=seed).learn(100).theta for seed in (0, 1))
     assert not th.equal(first, other)
-
-
-@pytest.mark.parametrize("delta_std", [None, 0.1])
-def test_save_load_and_go_on_is_going_on(delta_std: float | None, tmp_path: Any) -> None:
-    model = make(make_vec_env("CartPole-v1", 2), delta_std=delta_std).learn(300)
-    model.save(tmp_path / "model")
-    loaded = FiniteDifference.load(tmp_path / "model", env=make_vec_env("CartPole-v1", 2), device="cpu")
-    assert th.equal(loaded.theta, model.theta)
-    for each in (model, loaded):
-        each.learn(300, reset_num_timesteps=False)
-    assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
-    assert th.equal(loaded.theta, model.theta)
 
 
 def test_schedules_end_at_zero_and_never_below() -> None:
@@ -209,11 +193,16 @@ def test_schedules_end_at_zero_and_never_below() -> None:
         seen.append(progress)
         return 0.1 * progress
 
+    class Scales(Recorder):
+        def _on_rollout_end(self) -> None:
+            scales.append(self.locals["delta_std"])
+
+    scales: list[float] = []
     model = make(learning_rate=schedule, delta_std=lambda progress: 0.01 + 0.1 * progress)
     for _ in range(2):
-        model.learn(300, reset_num_timesteps=False)
+        model.learn(300, Scales(), reset_num_timesteps=False)
     assert min(seen) >= 0 and max(seen) <= 1
-    assert model._delta_std < 0.11
+    assert 0.01 <= scales[-1] < scales[0] == 0.11
 
 
 def test_a_learning_rate_of_zero_leaves_theta_where_it_is() -> None:
@@ -224,22 +213,16 @@ def test_a_learning_rate_of_zero_leaves_theta_where_it_is() -> None:
 
 
 def test_common_random_numbers_reduce_the_variance_of_the_gradient() -> None:
-    def variance(common_random_numbers: bool) -> float:
-        model = make(Line(), common_random_numbers=common_random_numbers, n_delta=2, learning_rate=0.0, delta_std=0.1)
-        model._setup_learn(1)
-        model._prepare_search()
-        callback = Recorder_initialised(model)
-        return float(th.stack([model.estimate_gradient(callback) for _ in range(50)]).var())
-
-    assert variance(True) < variance(False) / 2
+    shared, own = (
+        th.stack([estimate.gradient for estimate in estimates(50, n_delta=2, common_random_numbers=is_shared)])
+        for is_shared in (True, False)
+    )
+    assert shared.var() < own.var() / 2
 
 
 def test_seeds_differ_from_update_to_update() -> None:
-    model = make(Line(), n_delta=1, learning_rate=0.0, perturbation=lambda k, n, generator: th.ones(k, n))
-    model._setup_learn(1)
-    model._prepare_search()
-    callback = Recorder_initialised(model)
-    assert len({float(model.estimate_gradient(callback)) for _ in range(3)}) == 3
+    found = estimates(3, n_delta=1, perturbation=lambda k, n, generator: th.ones(k, n))
+    assert len({float(estimate.gradient) for estimate in found}) == 3
 
 
 @pytest.mark.parametrize("norm_obs", [True, False])
@@ -270,8 +253,9 @@ def test_vec_normalize_is_frozen_in_an_update_and_learns_between(norm_obs: bool)
 def test_utilities_are_sums_of_rewards_before_their_scaling() -> None:
     env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_reward=True)
     env.ret_rms.var = np.array(100.0)
-    model = make(env, n_delta=2).learn(1)
-    lengths = [float(utility) for utility in th.cat(model._utility.values)]
+    callback = Recorder()
+    model = make(env, n_delta=2).learn(0, callback)
+    lengths = model.estimate_gradient(callback).utilities.tolist()
     assert all(length.is_integer() and length > 1 for length in lengths)
     assert sorted(lengths) == sorted(episode["l"] for episode in model.ep_info_buffer)
 
@@ -319,7 +303,7 @@ def test_a_policy_with_code_of_its_own_gives_the_same_and_says_that_it_is_slower
     for policy, verbose in (("MlpPolicy", 0), (Own, 1)):
         model = make(make_vec_env("CartPole-v1", 2), policy, n_delta=2, verbose=verbose)
         thetas.append(model.learn(100, log_interval=None).theta)
-    assert "Own has code of its own" in capsys.readouterr().out
+    assert "Own is not a plain MLP" in capsys.readouterr().out
     th.testing.assert_close(*thetas)
 
 
@@ -349,58 +333,6 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
 
     model = make(Line(), estimator=estimator, perturbation=perturbation, learning_rate=0.1).learn(2000)
     assert float(model.theta) == pytest.approx(3, abs=0.3)
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "error", "match"),
-    [
-        (dict(estimator="backward"), ValueError, "estimator must be .*'central'.* got 'backward'"),
-        (dict(estimator=3), TypeError, "estimator must be a name or a callable, got 3"),
-        (dict(perturbation="cube"), ValueError, "perturbation must be .*'sphere'.* got 'cube'"),
-        (dict(n_delta=0), ValueError, "n_delta must be at least 1, got 0"),
-        (dict(n_delta=1, estimator="regression"), ValueError, "n_delta must be at least 2, got 1"),
-        (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
-        (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
-        (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
-        (dict(delta_std=lambda progress: 1 - progress), ValueError, "delta_std .at progress 1. must be finite and > 0"),
-        (
-            dict(delta_std=lambda progress: 2 * progress - 1),
-            ValueError,
-            "delta_std .at progress 0. must be finite and >= 0",
-        ),
-        (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
-        (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
-        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0 and <= 1e.06, got -1"),
-        (dict(max_grad_norm=0), ValueError, "max_grad_norm must be finite and > 0, got 0"),
-        (dict(n_top=4), ValueError, "n_top=4 needs an n_delta of at least that, got n_delta=3"),
-        (dict(n_top=1, estimator="forward"), ValueError, "n_top=1 needs estimator='central'"),
-        (dict(policy="NoPolicy"), ValueError, "NoPolicy"),
-        (dict(policy=th.nn.Linear), TypeError, "policy must be a name or a subclass of ActorCriticPolicy"),
-    ],
-)
-def test_bad_arguments_are_named(kwargs: dict[str, Any], error: type[Exception], match: str) -> None:
-    with pytest.raises(error, match=match):
-        make(**kwargs)
-
-
-def test_bad_arguments_of_learn_are_named() -> None:
-    for kwargs in (dict(total_timesteps=float("nan")), dict(total_timesteps=10, log_interval=0)):
-        with pytest.raises(ValueError, match=str(list(kwargs)[-1])):
-            make().learn(**kwargs)
-
-
-@pytest.mark.parametrize(
-    "space", [spaces.Tuple([spaces.Discrete(2)]), spaces.Text(3), spaces.Sequence(spaces.Discrete(2))]
-)
-def test_unsupported_spaces_are_an_error(space: spaces.Space) -> None:
-    class Odd(Line):
-        pass
-
-    for name in ("observation_space", "action_space"):
-        env = Odd()
-        setattr(env, name, space)
-        with pytest.raises(ValueError, match=f"{name.split('_')[0]} space must be"):
-            make(DummyVecEnv([lambda env=env: env]) if name == "action_space" else env)
 
 
 @pytest.mark.parametrize(

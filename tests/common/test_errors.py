@@ -1,11 +1,9 @@
 """A user's mistake gets an error that names the argument, its value and what is allowed, and nothing is lost."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
-from gymnasium import spaces
 from models import make, plain
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -13,124 +11,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_reinforce import REINFORCE
 
 NAN, INF = float("nan"), float("inf")
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    {
-        "learning_rate": (-1e-3, NAN, INF, "fast", None),
-        "n_steps": (0, -5, 2.5, NAN, "many", True),
-        "n_episodes": (0, -1, 1.5, INF),
-        "gamma": (-0.1, 1.1, NAN, INF, None),
-        "gae_lambda": (-0.1, 1.1, NAN),
-        "ent_coef": (-0.1, NAN, INF, "auto"),
-        "vf_coef": (-0.5, NAN, INF),
-        "max_grad_norm": (0, -1, NAN, INF),
-        "n_critic_updates": (0, -1, 1.5),
-        "batch_size": (0, -1, 0.5, NAN),
-        "critic_learning_rate": (-1e-3, NAN, INF),
-        "temperature": (0, -1.0, NAN, INF),
-        "min_std": (-0.1, NAN, INF),
-        "max_episode_steps": (0, -1, NAN),
-        "normalize_by": ("batch", 3),
-        "sde_sample_freq": (-2, 1.5),
-        "stats_window_size": (0, -1, NAN),
-        "seed": (-1, 1.5, "x"),
-        "reward_to_go": ("no", 1),
-        "discount_scores": ("no", None),
-        "normalize_advantage": ("no",),
-    }.items(),
-)
-def test_an_argument_out_of_its_range_is_named_with_its_value(name, values):
-    for value in values:
-        with pytest.raises((ValueError, TypeError), match=name) as error:
-            REINFORCE("MlpPolicy", "CartPole-v1", **{name: value})
-        assert str(value) in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["learning_rate", "critic_learning_rate", "ent_coef", "temperature"])
-@pytest.mark.parametrize("schedule", [lambda progress: NAN, lambda progress: -1.0, lambda progress: "x"])
-def test_a_schedule_that_returns_nonsense_is_named(name, schedule):
-    with pytest.raises((ValueError, TypeError), match=name):
-        REINFORCE("MlpPolicy", "CartPole-v1", **{name: schedule})
-
-
-@pytest.mark.parametrize("schedule", [lambda progress: 0.0, lambda progress: 1 - progress])
-def test_a_schedule_may_fall_to_an_excluded_bound_but_not_begin_there(schedule):
-    with pytest.raises(ValueError, match=r"temperature \(at progress 1\) must be finite and > 0"):
-        REINFORCE("MlpPolicy", "CartPole-v1", temperature=schedule)
-
-
-def test_a_schedule_that_goes_wrong_later_stops_training_before_a_step():
-    model = REINFORCE(
-        "MlpPolicy", "CartPole-v1", n_steps=8, learning_rate=lambda progress: NAN if 0 < progress < 0.6 else 1e-3
-    )
-    with pytest.raises(ValueError, match="learning_rate"):
-        model.learn(16)
-    assert model._n_updates == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"baseline": "average"}, ["baseline", "'average'", "'leave_one_out'", "'optimal'", "'time_mean'"]),
-        ({"baseline": 3}, ["baseline", "3", "callable"]),
-        ({"n_steps": 8, "n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
-        ({"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
-        ({"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
-        ({"baseline": "optimal", "n_episodes": 1}, ["n_episodes", "at least 2", "1"]),
-        ({"baseline": "leave_one_out", "n_episodes": 1}, ["n_episodes", "at least 2", "1"]),
-        ({"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
-    ],
-)
-def test_arguments_that_do_not_go_together(arguments, words):
-    with pytest.raises((ValueError, TypeError)) as error:
-        REINFORCE("MlpPolicy", "CartPole-v1", **arguments)
-    assert all(word in str(error.value) for word in words)
-
-
-def test_temperature_is_for_discrete_actions():
-    for temperature in (0.5, lambda progress: 1.0):
-        with pytest.raises(ValueError, match=r"temperature.*Box"):
-            REINFORCE("MlpPolicy", "Pendulum-v1", temperature=temperature)
-
-
-def test_load_checks_what_it_brings(tmp_path):
-    REINFORCE("MlpPolicy", "CartPole-v1", n_steps=8).save(tmp_path / "model")
-    for arguments in ({"gamma": 2.0}, {"n_episodes": 4}, {"baseline": "x"}, {"batch_size": 0}):
-        with pytest.raises(ValueError, match=next(iter(arguments))):
-            REINFORCE.load(tmp_path / "model", **arguments)
-
-
-@pytest.mark.parametrize("arguments", [{"total_timesteps": NAN}, {"total_timesteps": -1}, {"log_interval": 0}])
-def test_learn_checks_its_arguments(arguments):
-    model = REINFORCE("MlpPolicy", "CartPole-v1")
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        model.learn(**{"total_timesteps": 10, **arguments})
-
-
-@pytest.mark.parametrize(
-    "action_space",
-    [
-        spaces.Tuple([spaces.Discrete(2)]),
-        spaces.Box(-np.inf, np.inf, (2,)),
-        spaces.MultiBinary([2, 3]),
-        spaces.Dict({"a": spaces.Discrete(2)}),
-    ],
-)
-def test_an_action_space_that_no_policy_can_act_in(action_space):
-    with pytest.raises(ValueError, match="action space"):
-        REINFORCE("MlpPolicy", Corridor(action_space=action_space))
-
-
-def test_a_discrete_observation_must_start_at_zero():
-    for shifted in (spaces.Discrete(4, start=2), spaces.MultiDiscrete([2, 2], start=[0, 1])):
-
-        class Shifted(Corridor):
-            observation_space = property(lambda self, space=shifted: space, lambda self, space: None)
-
-        with pytest.raises(ValueError, match="start at 0"):
-            REINFORCE("MlpPolicy", Shifted())
 
 
 @pytest.mark.parametrize(
@@ -220,19 +100,6 @@ def test_temperature_needs_an_action_net_and_min_std_a_log_std():
         set_temperature(th.nn.Linear(1, 1), 0.5)
     with pytest.raises(ValueError, match="log_std"):
         floor_std(th.nn.Linear(1, 1), 0.1)
-
-
-def test_mlp_policy_cannot_take_dicts():
-    class Dicts(Corridor):
-        observation_space = property(lambda self: spaces.Dict({"a": spaces.Box(0, 1)}), lambda self, space: None)
-
-    with pytest.raises(ValueError, match="MultiInputPolicy"):
-        REINFORCE("MlpPolicy", Dicts())
-
-
-def test_gsde_is_for_box_actions():
-    with pytest.raises(ValueError, match="gSDE"):
-        REINFORCE("MlpPolicy", gym.make("CartPole-v1"), use_sde=True)
 
 
 # Finite gradients that lead to parameters that are not
