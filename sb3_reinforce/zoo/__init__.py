@@ -8,7 +8,12 @@ nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce
 try:
     import rl_zoo3.train
 except ImportError as error:
-    raise ImportError(f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]'") from error
+    # Given its name, `python -m sb3_reinforce.zoo` prints the sentence without a traceback
+    raise ImportError(
+        f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]', or pip install -e '.[zoo]' "
+        "in a clone of the repository",
+        name=__name__,
+    ) from error
 
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params
 

@@ -1,7 +1,9 @@
 """The RL Zoo's commands, with REINFORCE and FiniteDifference: ``python -m sb3_reinforce.zoo <command> ...``."""
 
 import argparse
+import contextlib
 import importlib
+import io
 import os
 import runpy
 import subprocess
@@ -79,31 +81,58 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -> None:
     """Exit with a sentence for arguments that the Zoo would ignore, or end with a traceback for."""
     known = argparse.ArgumentParser(parser.prog, parser.usage, add_help=False, allow_abbrev=False)
-    for name in ("--env", "--algo", "--storage", "--study-name", "--trial-id"):
+    known.add_argument("--env", default="CartPole-v1")
+    known.add_argument("--algo", default="ppo")
+    known.add_argument("--exp-id", type=int, default=0)
+    for name in ("--storage", "--study-name", "--trial-id", "--load-checkpoint"):
         known.add_argument(name)
     known.add_argument("-f", "--folder")
     known.add_argument("-i", "--trained-agent")
     known.add_argument("--log-dir", default="rl-trained-agents/")
-    known.add_argument("--no-hub", action="store_true")
+    for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
+        known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         known.add_argument(*names, nargs="+", action=StorePython)
     given, _ = known.parse_known_args(arguments)
     if command == "benchmark":
         check_benchmark(parser, given)
         return
-    if given.env is not None and given.env not in gym.registry:
+    if given.algo not in utils.ALGOS:
+        hint = closest(given.algo, utils.ALGOS) or f", only {', '.join(utils.ALGOS)}"
+        parser.error(f"there is no --algo {given.algo}{hint}")
+    if given.env not in gym.registry:
         parser.error(
             f"--env {given.env} is not registered (an environment of another package needs --gym-packages PACKAGE)"
             f"{closest(given.env, gym.registry)}"
         )
+    for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
+        try:
+            if env_kwargs:
+                gym.make(given.env, **env_kwargs).close()
+        except TypeError as error:
+            parser.error(f"{option}: {error}")
     if command != "train":
-        if given.algo in ALGORITHMS and given.folder is None:
-            parser.error(f"there are no published models of {given.algo}: pass the folder of your own, such as -f logs")
+        check_model(parser, given)
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
     if given.trained_agent and not (given.trained_agent.endswith(".zip") and os.path.isfile(given.trained_agent)):
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
+
+
+def check_model(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Exit with a sentence where there is no model; the Zoo downloads its own models where no folder is given."""
+    if given.folder is None:
+        if given.algo in ALGORITHMS:
+            parser.error(f"there are no published models of {given.algo}: pass the folder of your own, such as -f logs")
+        return
+    which = (given.load_best, given.load_checkpoint, given.load_last_checkpoint)
+    try:
+        # The command itself prints the same again
+        with contextlib.redirect_stdout(io.StringIO()):
+            utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env), *which)
+    except (AssertionError, ValueError) as error:
+        parser.error(f"{error}: pass the folder that train has written, and the --algo and --env of the model")
 
 
 def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -142,7 +171,7 @@ def main() -> None:
             run_script(command)
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        hint = "pip install 'sb3-reinforce[zoo]'" if missing in EXTRA else "install it, or correct the name"
+        hint = "reinstall with the extra [zoo]" if missing in EXTRA else "install it, or correct the name"
         parser.error(f"{error}: {hint}")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))

@@ -80,7 +80,8 @@ class Experiment(ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found, self.optimize_hyperparameters)
-        self.argument_names |= as_dict("policy_kwargs", found.get("policy_kwargs")).keys()
+        for key in ("policy_kwargs", "env_kwargs"):
+            self.argument_names |= as_dict(key, found.get(key)).keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
         return found, saved

@@ -79,6 +79,7 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
         ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
         ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: 3", "env_kwargs must be a dict, got 3"),
+        ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
         ("policy: MlpPolicy, n_timesteps: 100, frame_stack: a", "frame_stack must be an integer, got 'a'"),
         ("policy: CnnPolicy, n_timesteps: 100", "You should use NatureCNN only with images"),
     ],
@@ -107,7 +108,11 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
     [
         (["fly"], "there is no command 'fly', only train, enjoy"),
         (["push_to_hub"], "push_to_hub is not offered"),
-        (["train", "--algo", "reinforc"], "invalid choice: 'reinforc'"),
+        (["train", "--algo", "reinforced"], "there is no --algo reinforced: did you mean reinforce?"),
+        (["enjoy", "--algo", "x"], "there is no --algo x, only a2c, "),
+        (["train", "--env-kwargs", "gravty:3"], "--env-kwargs: CartPoleEnv.__init__() got an unexpected keyword"),
+        (["enjoy", "--algo", "reinforce", "-f", "logs"], "The logs/reinforce folder was not found: pass the folder"),
+        (["record_video", "-f", ".", "--exp-id", "-1"], "The ./ppo folder was not found: pass the folder"),
         (["train", "--env", "CartPol-v1"], "--gym-packages PACKAGE): did you mean CartPole-v"),
         (["train", "-params", "baseline:none"], "write a text as"),
         (["train", "-params", "n_steps:1/0"], "the value of 'n_steps:1/0' must be Python (ZeroDivisionError"),
@@ -164,4 +169,4 @@ def test_a_package_of_the_extra_that_is_missing_is_named(
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "seaborn", None)
     message = message_of(capsys, "plot_train")
-    assert "seaborn" in message and "pip install 'sb3-reinforce[zoo]'" in message
+    assert "seaborn" in message and "[zoo]" in message
