@@ -26,4 +26,5 @@ __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 rl_zoo3.ALGOS.update(ALGORITHMS)
 HYPERPARAMS_SAMPLER.update(reinforce=samplers.sample_reinforce, finite_difference=samplers.sample_finite_difference)
 HYPERPARAMS_CONVERTER.update(reinforce=convert_onpolicy_params, finite_difference=samplers.convert_finite_difference)
+# The command train makes its experiment by this name
 rl_zoo3.train.ExperimentManager = make_experiment  # type: ignore[misc,assignment]

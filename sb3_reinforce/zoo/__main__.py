@@ -27,10 +27,8 @@ FUNCTIONS = {
 SCRIPTS = {"record_video": "rl_zoo3.record_video", "benchmark": "rl_zoo3.benchmark"}
 COMMANDS = (*FUNCTIONS, *SCRIPTS)
 CHECKED = ("train", "enjoy", "record_video", "benchmark")
-# Installed with the extra, but not needed by `import rl_zoo3`
-EXTRA = {"matplotlib", "pandas", "requests", "rliable", "scipy", "seaborn"}
 NOT_OFFERED = {
-    "push_to_hub": "the Zoo's push_to_hub cannot be imported with any huggingface_sb3 that it can be installed with",
+    "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
     "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
     "record_training": "record the checkpoints one by one: record_video --load-checkpoint STEPS",
 }
@@ -86,7 +84,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
     known.add_argument("--exp-id", type=int, default=0)
     for name in ("--storage", "--study-name", "--trial-id", "--load-checkpoint"):
         known.add_argument(name)
-    known.add_argument("-f", "--folder")
+    known.add_argument("-f", "--folder", default="rl-trained-agents")
     known.add_argument("-i", "--trained-agent")
     known.add_argument("--log-dir", default="rl-trained-agents/")
     for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
@@ -112,7 +110,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         except TypeError as error:
             parser.error(f"{option}: {error}")
     if command != "train":
-        check_model(parser, given)
+        check_model(parser, command, given)
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
@@ -120,19 +118,16 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
 
 
-def check_model(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """Exit with a sentence where there is no model; the Zoo downloads its own models where no folder is given."""
-    if given.folder is None:
-        if given.algo in ALGORITHMS:
-            parser.error(f"there are no published models of {given.algo}: pass the folder of your own, such as -f logs")
-        return
+def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.Namespace) -> None:
+    """Exit with a sentence where there is no model, unless it is one that the Zoo downloads."""
     which = (given.load_best, given.load_checkpoint, given.load_last_checkpoint)
     try:
         # The command itself prints the same again
         with contextlib.redirect_stdout(io.StringIO()):
             utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env), *which)
     except (AssertionError, ValueError) as error:
-        parser.error(f"{error}: pass the folder that train has written, and the --algo and --env of the model")
+        if command == "record_video" or given.algo in ALGORITHMS or "rl-trained-agents" not in given.folder:
+            parser.error(f"{error}: pass the folder of your models, such as -f logs, and their --algo and --env")
 
 
 def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -170,9 +165,7 @@ def main() -> None:
         else:
             run_script(command)
     except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        hint = "reinstall with the extra [zoo]" if missing in EXTRA else "install it, or correct the name"
-        parser.error(f"{error}: {hint}")
+        parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))
     except ValueError as error:

@@ -87,12 +87,9 @@ class Experiment(ExperimentManager):
         return found, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> tuple[Any, ...]:
-        """
-        Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule.
-
-        The Zoo converts only ``learning_rate`` and ``delta_std``, to a class without which the saved model could not be
-        loaded. No public method stands between its reading of the settings and the model.
-        """
+        """Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule."""
+        # The Zoo converts two of them, to a class without which the saved model could not be loaded. No public method
+        # stands between the settings and the model
         linear = {}
         for key in scheduled_keys(self.algo) & hyperparams.keys():
             if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):

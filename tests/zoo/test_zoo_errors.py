@@ -18,7 +18,7 @@ from zoo_commands import message_of, train
 
 from sb3_reinforce.zoo import __main__
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 REINFORCE = ["train", "--algo", "reinforce"]
 
@@ -124,7 +124,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
-        (["enjoy", "--algo", "reinforce"], "no published models of reinforce"),
+        (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
         ([*REINFORCE, "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
         (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
         (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
@@ -139,7 +139,7 @@ def test_a_wrong_command_is_answered_with_a_sentence(
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])
-def test_a_benchmark_without_network_is_told_of_no_hub(
+def test_a_benchmark_without_network_says_to_pass_no_hub(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", raising(error))
