@@ -17,22 +17,26 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import MAX_LEARNING_RATE, CheckedSchedule, check_function
-from sb3_reinforce.common.base import Persistent
-from sb3_reinforce.common.common_settings import check_basics, check_learn
+from sb3_reinforce.common.arguments import check_function
+from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.prediction import predict
-from sb3_reinforce.common.search_settings import (
+from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
+from sb3_reinforce.envs.guards import guarded
+from sb3_reinforce.estimation.estimators import (
+    ESTIMATORS,
+    Estimator,
+    central_difference,
     check_deltas,
-    check_finite_difference,
-    check_gradient,
+    check_estimate,
+    fit_quality,
+)
+from sb3_reinforce.estimation.perturbations import (
+    PERTURBATIONS,
+    Perturbation,
     default_delta_std,
     default_n_delta,
+    new_generator,
 )
-from sb3_reinforce.common.spaces import check_env
-from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.estimation.estimators import ESTIMATORS, Estimator, central_difference, fit_quality
-from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, new_generator
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_actor
@@ -42,7 +46,7 @@ from sb3_reinforce.sampling.utility import Stopped, Utility
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
 
-class FiniteDifference(Persistent):
+class FiniteDifference(BasePolicyGradient):
     """
     Search in the space of a policy's parameters, by a gradient that is estimated from returns alone.
 
@@ -97,7 +101,7 @@ class FiniteDifference(Persistent):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     policy: ActorCriticPolicy
-    predict = predict
+    _arguments = FINITE_DIFFERENCE_ARGUMENTS
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
 
@@ -125,14 +129,12 @@ class FiniteDifference(Persistent):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        check_basics(policy, policy_kwargs, stats_window_size, tensorboard_log, verbose, seed, device)
-        if env is not None or _init_setup_model:
-            env = check_env(env, verbose)
         super().__init__(
             policy,
             env,
+            needs_env=_init_setup_model,
             learning_rate=learning_rate,
-            policy_kwargs=None if policy_kwargs is None else dict(policy_kwargs),
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -156,13 +158,8 @@ class FiniteDifference(Persistent):
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = CheckedSchedule("learning_rate", self.learning_rate, high=MAX_LEARNING_RATE)
-        if self.delta_std is not None:
-            self.delta_std_schedule = CheckedSchedule("delta_std", self.delta_std, above=True)
-
     def _setup_model(self) -> None:
-        check_finite_difference(self)
+        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)
         policy_class = cast(type[ActorCriticPolicy], self.policy_class)
@@ -193,10 +190,6 @@ class FiniteDifference(Persistent):
     def n_parameters(self) -> int:
         """n, the number of parameters that are searched."""
         return sum(parameter.numel() for parameter in self._actor_parameters)
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # An update that begins after a callback or a user has moved the count must not train at a negative rate
-        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
     @guarded
     def learn(
@@ -266,11 +259,7 @@ class FiniteDifference(Persistent):
         :raises ValueError: As ``learn``
         """
         theta = self.theta
-        self._delta_std = (
-            default_delta_std(theta)
-            if self.delta_std is None
-            else self.delta_std_schedule(self._current_progress_remaining)
-        )
+        self._delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
         perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
         n_delta, generator = cast(int, self.n_delta), cast(th.Generator, self._generator)
         deltas = self._delta_std * check_deltas(perturbation(n_delta, len(theta), generator), n_delta, len(theta))
@@ -284,7 +273,7 @@ class FiniteDifference(Persistent):
         try:
             with frozen(self._vec_normalize_env) as observed:
                 utility = self._utility = Utility(self, self._actor, callback, observed, first_seed)
-                gradient = check_gradient(estimator(utility, theta, deltas), len(theta))
+                gradient = check_estimate(estimator(utility, theta, deltas), len(theta))
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:

@@ -1,11 +1,10 @@
-"""Saving a model, loading it and going on."""
+"""What both algorithms inherit: checked arguments, prediction, saving, loading and going on."""
 
 import pickle
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
-from inspect import signature
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -13,90 +12,153 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
-from sb3_reinforce.common.arguments import check_flag
-from sb3_reinforce.common.spaces import check_env
-from sb3_reinforce.common.storage import Place, check_archive, whole_or_not_at_all
+from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
+from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.settings import ATTRIBUTES
+from sb3_reinforce.common.spaces import check_env, shift_to_start
+from sb3_reinforce.common.storage import PathOrFile, atomic_write, check_archive
 
-Model = TypeVar("Model", bound="Persistent")
+__all__ = ["BasePolicyGradient", "uninterrupted"]
+
+Model = TypeVar("Model", bound="BasePolicyGradient")
+
+# Arguments of Stable-Baselines3's ``load`` that are not stored in the model
+LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"}
 
 
-class Persistent(BaseAlgorithm):
+class BasePolicyGradient(BaseAlgorithm):
     """
-    Saving a model, loading it and going on: all of it happens, or nothing.
+    What both algorithms have in common besides the mathematics: saving and loading change everything or nothing.
 
-    What the algorithms inherit, since ``load`` is a method of the class. Each method does what that of its name does in
-    Stable-Baselines3, and what its docstring says.
+    ``_arguments`` are the checks of the constructor's arguments, which also build the schedules.
     """
 
+    _arguments: ClassVar[Mapping[str, Check]]
     _random_state: bytes
 
-    def save(self, path: Place, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
+    def __init__(self, policy: Any, env: Any, *, needs_env: bool, policy_kwargs: Any, verbose: int, **kwargs: Any):
+        kwargs |= {"policy": policy, "policy_kwargs": policy_kwargs, "verbose": verbose}
+        # Stable-Baselines3 uses some arguments as soon as it has them
+        for name in kwargs.keys() & self._arguments.keys():
+            self._arguments[name](name, kwargs[name])
+        if needs_env or env is not None:
+            env = check_env(env, verbose)
+        if policy_kwargs is not None:
+            # Algorithms write to it
+            kwargs["policy_kwargs"] = dict(policy_kwargs)
+        self._schedules: dict[str, CheckedSchedule] = {}
+        super().__init__(env=env, **kwargs)
+
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = self._schedule("learning_rate")
+
+    def _schedule(self, name: str) -> CheckedSchedule:
+        """Return the checked schedule of an argument, a new one where a callback has set another value."""
+        given = getattr(self, name)
+        if name not in self._schedules or self._schedules[name].given is not given:
+            self._schedules[name] = self._arguments[name](name, given)
+        return self._schedules[name]
+
+    def _scheduled(self, name: str) -> float:
+        """Return the present value of an argument that may be a schedule."""
+        return self._schedule(name)(self._current_progress_remaining)
+
+    def _function(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
+        """Return the function that an argument names, or the user's own."""
+        return check_function(name, getattr(self, name), functions)
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last rollout may overshoot total_timesteps, and must not train at a negative rate
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_schedules"]
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Get the policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
+
+        :param observation: The input observation
+        :param state: The last states of a recurrent policy; other policies pass it on
+        :param episode_start: Whether each observation is the first of an episode, for recurrent policies
+        :param deterministic: Whether to return the most likely action instead of a sample
+        :return: The action and the next state
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return shift_to_start(self.action_space, actions), state
+
+    def save(
+        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
         """
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
 
         :param path: The file, to which ``.zip`` is added where it has no suffix
         :param exclude: Attributes not to save, besides those that never are
         :param include: Attributes to save that otherwise are not
+        :raises OSError: If the file cannot be written
         """
         device = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         states = random.getstate(), np.random.get_state(), th.get_rng_state(), device
         # As bytes, since Stable-Baselines3 would print each of their numbers into the file
         self._random_state = pickle.dumps(states)
-        with whole_or_not_at_all(path) as file:
+        with atomic_write(path) as file:
             super().save(file, exclude, include)
 
     @classmethod
     def load(
         cls: type[Model],
-        path: Place,
+        path: PathOrFile,
         env: GymEnv | None = None,
         *args: Any,
         restore_random_state: bool = False,
         **kwargs: Any,
     ) -> Model:
         """
-        Load a model. This runs code from the file: load only what you trust (see ``set_parameters``).
+        Load a model. This runs code from the file: load only files that you trust (see ``set_parameters``).
 
         :param path: The file
-        :param env: The environment to go on in; None for prediction alone
+        :param env: The environment to continue in; None for prediction alone
         :param args: Further arguments of ``load`` in Stable-Baselines3
         :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
-            device) into the state in which they were when the model was saved. Training then goes on as if it had not
-            been interrupted, from a reset of the environments on; their inside, their generators and the statistics of
-            VecNormalize are not in the file. A model with a seed seeds them anew here: to seed them otherwise, do so
-            after loading
+            device) into the state in which they were when the model was saved. Training then continues as if it had
+            not been interrupted, from a reset of the environments on; the file has neither the environments' state and
+            generators nor the statistics of VecNormalize. Without it, a model with a seed seeds the generators again:
+            to seed them otherwise, do so after loading
         :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones
         :return: The model
-        :raises TypeError: If an argument is of the wrong kind, or the algorithm has none of this name
+        :raises TypeError: If an argument is of the wrong type, or the algorithm has none of this name
         :raises ValueError: If an argument is out of its range, or the file is damaged or has no random state
         """
         check_flag("restore_random_state", restore_random_state)
-        known = arguments_of(cls) - {"self", "policy", "env", "stats_window_size", "_init_setup_model"}
-        unknown = sorted(kwargs.keys() - known - {"device", "custom_objects", "print_system_info", "force_reset"})
+        saved = check_archive(path, ("data", "policy.pth"))
+        arguments = cls._arguments.keys() - ATTRIBUTES.keys()
+        unknown = sorted(kwargs.keys() - arguments - saved - LOAD_ARGUMENTS)
         if unknown:
             raise TypeError(
-                f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {', '.join(sorted(known))}"
+                f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {', '.join(sorted(arguments))}"
             )
+        if restore_random_state and "_random_state" not in saved:
+            raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         if env is not None:
             env = check_env(env, verbose=0)
-        if "_random_state" not in check_archive(path, ("data", "policy.pth")) and restore_random_state:
-            raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         model = super().load(path, env, *args, **kwargs)
-        if kwargs.get("seed") is not None and not restore_random_state:
-            # A generator that was saved goes on from the seed before
-            model.set_random_seed(model.seed)
         if restore_random_state:
-            python, numpy, torch, device = pickle.loads(model._random_state)
-            random.setstate(python)
-            np.random.set_state(numpy)
-            th.set_rng_state(torch)
-            if device is not None and model.device.type == "cuda":
-                th.cuda.set_rng_state(device, model.device)
+            restore_generators(model._random_state, model.device)
+        elif kwargs.get("seed") is not None:
+            # A generator that was saved continues from the seed before
+            model.set_random_seed(model.seed)
         return model
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        Go on in another environment.
+        Continue in another environment.
 
         :param env: As many environments as before, with the same spaces
         :param force_reset: Whether to reset them before training
@@ -106,21 +168,21 @@ class Persistent(BaseAlgorithm):
         super().set_env(check_env(env, self.verbose, self.n_envs), force_reset)
 
     def set_parameters(
-        self, load_path_or_dict: Place | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+        self, load_path_or_dict: PathOrFile | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
         Take parameters from a file or dictionary, which may be those of another algorithm with the same policy class:
-        all of them, or where anything is wrong none.
+        all of them, or none if anything is wrong.
 
-        From a file tensors alone are read (``weights_only``): no code in it is run.
+        From a file only tensors are read (``weights_only``): no code in it is run.
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
         :param exact_match: Whether there must be a state for everything that has one here, and nothing else; if not,
             what this model does not have, such as an optimizer for the critic, is left out
         :param device: Device on which the parameters are loaded
         :raises TypeError: If a state is not a dict
-        :raises ValueError: If names do not match, a number is not finite, or a state is that of another optimizer or
-            of other parameters
+        :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
+            to other parameters
         :raises RuntimeError: If the parameters of the policy have other names or shapes
         """
         states = load_path_or_dict
@@ -131,48 +193,44 @@ class Persistent(BaseAlgorithm):
         if exact_match and states.keys() != set(names):
             raise ValueError(f"load_path_or_dict must have {', '.join(names)}, got {', '.join(map(str, states))}")
         own = {name: states[name] for name in names if name in states}
-        # A mask that a user's policy adds to its logits may well be infinite
-        buffers = {f"policy.{name}" for name, _ in self.policy.named_buffers()}
         for name, state in own.items():
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
-            for key, number in numbers(name, state):
-                if th.isnan(number).any() or (key not in buffers and th.isinf(number).any()):
-                    raise ValueError(f"load_path_or_dict must have finite numbers, got {number} for {key}")
+            part = recursive_getattr(self, name)
+            if isinstance(part, th.optim.Optimizer) and (reason := mismatch(part, state)):
+                raise ValueError(
+                    f"load_path_or_dict[{name!r}] must be the state of a {type(part).__name__} for this policy, but "
+                    f"{reason}"
+                )
+        # A mask that a user's policy adds to its logits may well be infinite
+        check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
         try:
             super().set_parameters(own, exact_match, device)
-            for name in own:
-                if isinstance(part := recursive_getattr(self, name), th.optim.Optimizer):
-                    check_optimizer(name, part, before[name])
         except BaseException:
             super().set_parameters(before, device=device)
             raise
 
 
-def arguments_of(cls: type) -> set[str]:
-    """
-    The names of the arguments of a class, also of those that it hands on to the class above by ``**kwargs``.
+def restore_generators(states: bytes, device: th.device) -> None:
+    """Restore the states of the global random generators, the device's too."""
+    python, numpy, torch, cuda = pickle.loads(states)
+    random.setstate(python)
+    np.random.set_state(numpy)
+    th.set_rng_state(torch)
+    if cuda is not None and device.type == "cuda":
+        th.cuda.set_rng_state(cuda, device)
 
-    :param cls: The class
-    """
-    names: set[str] = set()
-    for each in cls.__mro__:
-        parameters = signature(each.__init__).parameters.values()  # type: ignore[misc]
-        handed_on = {parameter.name for parameter in parameters if parameter.kind is parameter.VAR_KEYWORD}
-        names |= {parameter.name for parameter in parameters} - handed_on
-        if not handed_on:
-            break
-    return names
+
+def check_finite(states: Mapping[str, Any], infinite: set[str]) -> None:
+    """Check the numbers of nested states; those named by ``infinite`` may be infinite, but not NaN."""
+    for name, number in numbers("", states):
+        if th.isnan(number).any() or (name not in infinite and th.isinf(number).any()):
+            raise ValueError(f"load_path_or_dict must have finite numbers, got {number} for {name[1:]}")
 
 
 def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
-    """
-    The tensors and floats of a state, each with its name.
-
-    :param name: The name of the state
-    :param state: As of ``state_dict()``
-    """
+    """Yield the tensors and floats of a nested state, each with its path."""
     if isinstance(state, (th.Tensor, float)):
         yield name, th.as_tensor(state)
     elif isinstance(state, (Mapping, list, tuple)):
@@ -181,28 +239,25 @@ def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
             yield from numbers(f"{name}.{key}", part)
 
 
-def check_optimizer(name: str, optimizer: th.optim.Optimizer, before: Mapping[str, Any]) -> None:
-    """
-    Check that an optimizer has kept its settings, and that its moments are those of its parameters: a fused one would
-    write beyond moments of another shape.
-
-    :param name: Its name
-    :param optimizer: The optimizer with its new state
-    :param before: The state that it had
-    :raises ValueError: If a setting is missing or of another kind, or moments do not go with the parameters
-    """
-    other = f"load_path_or_dict[{name!r}] must be the state of a {type(optimizer).__name__} for this policy, but"
-    for group in optimizer.param_groups:
-        for setting, old in before["param_groups"][0].items():
+def mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) -> str:
+    """Return why a state does not belong to this kind of optimizer and its parameters, "" if it does."""
+    own = optimizer.state_dict()
+    groups = state.get("param_groups", [])
+    if [len(group["params"]) for group in groups] != [len(group["params"]) for group in own["param_groups"]]:
+        return "it has other groups of parameters"
+    for setting, value in own["param_groups"][0].items():
+        for group in groups:
             if setting not in group:
-                raise ValueError(f"{other} it has no {setting}: it is that of another optimizer")
-            if isinstance(old, (float, tuple)) and type(group[setting]) not in (type(old), list, int):
-                raise ValueError(f"{other} its {setting} is {group[setting]!r}")
+                return f"it has no {setting}: it belongs to another optimizer"
+            if isinstance(value, (float, tuple)) and type(group[setting]) not in (type(value), list, int):
+                return f"its {setting} is {group[setting]!r}"
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for index, moments in optimizer.state_dict()["state"].items():
-        # Those of some optimizers have a shape of their own
-        known = {key: np.shape(value) for key, value in before["state"].get(index, {}).items()}
-        for key in known.keys() | (moments.keys() if optimizer.defaults.get("fused") else ()):
-            expected, got = known.get(key, tuple(parameters[index].shape)), np.shape(moments.get(key))
-            if key not in moments or (got and got != expected):
-                raise ValueError(f"{other} its {key} of parameter {index} must have shape {expected}, got {got}")
+    for index, moments in state.get("state", {}).items():
+        shapes = {key: np.shape(value) for key, value in own["state"].get(index, {}).items()}
+        if not shapes and "fused" in optimizer.defaults:
+            # These optimizers go through moments and parameter side by side, and would write beyond shorter ones
+            shapes = dict.fromkeys(moments, tuple(parameters[index].shape))
+        for key, shape in shapes.items():
+            if key not in moments or np.shape(moments[key]) not in ((), shape):
+                return f"its {key} of parameter {index} must have shape {shape}, got {np.shape(moments.get(key))}"
+    return ""

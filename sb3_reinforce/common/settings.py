@@ -1,38 +1,132 @@
-"""What the arguments of REINFORCE must satisfy, alone and together, and what those left open become."""
+"""The arguments of both algorithms: one table of checks for each, and what arguments must satisfy together."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
 
 from sb3_reinforce.common.arguments import (
-    as_integers,
-    check_choice,
+    MAX_LEARNING_RATE,
+    Check,
+    CheckedSchedule,
+    check_device,
     check_flag,
     check_function,
-    check_kind,
-    check_number,
+    check_name,
+    check_subclass,
+    choice,
+    integer,
+    kind,
+    number,
+    optional,
+    schedule,
+    wrong_type,
 )
-from sb3_reinforce.common.common_settings import check_basics_of
-from sb3_reinforce.estimation.baselines import BASELINES
 
+Functions = Mapping[str, Callable[..., Any]]
+
+# What NumPy takes
+MAX_SEED = 2**32 - 1
+# At this temperature float32 logits prefer no action
+MAX_TEMPERATURE = 1e6
 DEFAULT_N_STEPS = 32
 DEFAULT_N_EPISODES = 16
 
 
-def check_reinforce(model: Any) -> None:
-    """
-    Check a model's arguments, and choose between fixed rollouts and whole episodes where the user has not.
+def check_policy(name: str, value: Any) -> Any:
+    """Return a policy's name or class."""
+    if not isinstance(value, (str, type)):
+        raise wrong_type(name, "a name or a class", value)
+    return value
 
-    Called at construction and again by ``load``, which may bring other arguments and another action space.
 
-    :param model: A ``REINFORCE`` with its arguments as attributes
-    :raises TypeError: If an argument is of the wrong kind
-    :raises ValueError: If an argument is out of its range, or does not go with another
-    """
-    check_basics_of(model)
-    check_function("baseline", model.baseline, BASELINES)
+def check_callback(name: str, value: Any) -> Any:
+    """Return a callback, a function, a list of callbacks or None."""
+    is_function = callable(value) and not isinstance(value, type)
+    callbacks = value if isinstance(value, list) else [value]
+    if not (value is None or is_function or all(isinstance(each, BaseCallback) for each in callbacks)):
+        raise TypeError(f"{name} must be a callback, a list of callbacks, a function or None, got {value!r}")
+    return value
+
+
+COMMON_ARGUMENTS: dict[str, Check] = {
+    "policy": check_policy,
+    "learning_rate": schedule(high=MAX_LEARNING_RATE),
+    "max_grad_norm": optional(number(0, above=True)),
+    "max_episode_steps": integer(1),
+    "stats_window_size": integer(1),
+    "tensorboard_log": optional(kind(str, os.PathLike)),
+    "policy_kwargs": optional(kind(Mapping)),
+    "verbose": integer(0),
+    "seed": optional(integer(0, MAX_SEED)),
+    "device": check_device,
+}
+REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
+    "n_steps": optional(integer(1)),
+    "gamma": number(0, 1),
+    "gae_lambda": number(0, 1),
+    "ent_coef": schedule(),
+    "vf_coef": number(0),
+    "baseline": check_name,
+    "n_episodes": optional(integer(1)),
+    "reward_to_go": check_flag,
+    "discount_scores": check_flag,
+    "normalize_by": choice("steps", "episodes"),
+    "n_critic_updates": integer(1),
+    "batch_size": integer(1),
+    "critic_learning_rate": optional(schedule(high=MAX_LEARNING_RATE)),
+    "temperature": schedule(above=True, high=MAX_TEMPERATURE),
+    "min_std": number(0),
+    "use_sde": check_flag,
+    "sde_sample_freq": integer(-1),
+    "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
+    "rollout_buffer_kwargs": optional(kind(Mapping)),
+    "normalize_advantage": check_flag,
+}
+FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
+    "estimator": check_name,
+    "perturbation": check_name,
+    "n_delta": optional(integer(1)),
+    "delta_std": optional(schedule(above=True)),
+    "n_eval_episodes": integer(1),
+    "common_random_numbers": check_flag,
+    "n_top": optional(integer(1)),
+    "standardize_utilities": check_flag,
+    "deterministic": check_flag,
+}
+LEARN_ARGUMENTS: dict[str, Check] = {
+    "total_timesteps": number(0),
+    "callback": check_callback,
+    "log_interval": optional(integer(1)),
+    "tb_log_name": kind(str),
+    "reset_num_timesteps": check_flag,
+    "progress_bar": check_flag,
+}
+# Stable-Baselines3 stores these arguments under other names
+ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
+
+
+def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
+    """Check the arguments as the model has them now, and store each in Python's own type."""
+    for name, check in arguments.items():
+        attribute = ATTRIBUTES.get(name, name)
+        value = check(name, getattr(model, attribute))
+        if not isinstance(value, CheckedSchedule):
+            setattr(model, attribute, value)
+    space = model.observation_space
+    if model.policy_class is MultiInputActorCriticPolicy and not isinstance(space, spaces.Dict):
+        raise ValueError(f"policy must be MlpPolicy or CnnPolicy for observations in {space}, got MultiInputPolicy")
+
+
+def check_reinforce(model: Any, baselines: Functions) -> None:
+    """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
+    check_attributes(model, REINFORCE_ARGUMENTS)
+    check_function("baseline", model.baseline, baselines)
     if model.n_steps is None and model.n_episodes is None:
         model.n_steps = DEFAULT_N_STEPS if model.has_critic else None
         model.n_episodes = None if model.has_critic else DEFAULT_N_EPISODES
@@ -41,25 +135,11 @@ def check_reinforce(model: Any) -> None:
             f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r} are both given: a rollout is either a "
             "number of steps or a number of whole episodes, so set one of them to None"
         )
-    least = {"n_critic_updates": 1, "batch_size": 1, "max_episode_steps": 1, "sde_sample_freq": -1}
-    if model.n_steps is None:
-        least["n_episodes"] = 2 if model.baseline in ("leave_one_out", "optimal") else 1
-    else:
-        least["n_steps"] = 1
-    as_integers(model, least)
-    for name in ("reward_to_go", "discount_scores", "normalize_advantage", "use_sde"):
-        check_flag(name, getattr(model, name))
-    check_kind("rollout_buffer_kwargs", model.rollout_buffer_kwargs, (Mapping,))
-    buffer_class = model.rollout_buffer_class
-    if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, RolloutBuffer)):
-        raise TypeError(f"rollout_buffer_class must be a subclass of RolloutBuffer, got {buffer_class!r}")
-    check_number("gamma", model.gamma, 0, 1)
-    check_number("gae_lambda", model.gae_lambda, 0, 1)
-    check_number("vf_coef", model.vf_coef, 0)
-    check_number("min_std", model.min_std, 0)
-    if model.max_grad_norm is not None:
-        check_number("max_grad_norm", model.max_grad_norm, 0, above=True)
-    check_choice("normalize_by", model.normalize_by, ("steps", "episodes"))
+    if model.n_episodes == 1 and model.baseline in ("leave_one_out", "optimal"):
+        raise ValueError(
+            f"n_episodes must be at least 2 with baseline={model.baseline!r}, which is computed from the other "
+            "episodes of the rollout, got 1"
+        )
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
         raise ValueError(
             f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got "
@@ -70,3 +150,26 @@ def check_reinforce(model: Any) -> None:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")
     elif model.min_std > 0:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
+
+
+def check_finite_difference(model: Any, estimators: Functions, perturbations: Functions) -> None:
+    """Check the arguments of a FiniteDifference."""
+    check_attributes(model, FINITE_DIFFERENCE_ARGUMENTS)
+    check_subclass("policy", model.policy_class, ActorCriticPolicy)
+    check_function("estimator", model.estimator, estimators)
+    check_function("perturbation", model.perturbation, perturbations)
+    if model.n_delta == 1 and model.estimator == "regression":
+        raise ValueError("n_delta must be at least 2 with estimator='regression', which fits an intercept too, got 1")
+    if model.n_top is not None:
+        if model.estimator != "central":
+            raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
+        if model.n_delta is None or model.n_top > model.n_delta:
+            raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
+
+
+def check_learn(env: Any, *arguments: Any) -> None:
+    """Check the arguments of ``learn``, in their order."""
+    if env is None:
+        raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
+    for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
+        check(name, value)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.common.search_settings import default_delta_std, default_n_delta
 from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
@@ -15,7 +14,7 @@ from sb3_reinforce.diagnostics.moments import cosine, gram, moments, signal_to_n
 from sb3_reinforce.diagnostics.sampling import check_independent, seeded
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.estimators import ESTIMATORS
-from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.reinforce import REINFORCE
 

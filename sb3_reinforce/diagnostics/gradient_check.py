@@ -86,7 +86,7 @@ def check_rows(model: REINFORCE, n_episodes: int) -> list[CheckRow]:
     :param n_episodes: Episodes
     """
     sampler, infos = sampled(model, n_episodes, model.baseline)
-    policy, rollout = sampler.policy, sampler._rollout
+    policy, rollout = sampler.policy, sampler.rollout
     assert rollout is not None
     obs = select(rollout.observations, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)

@@ -29,7 +29,7 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     """
     plain = as_reinforce(model)
     sampler, infos = sampled(plain, n_episodes, "leave_one_out", seed=int(th.randint(2**31, ())))
-    rollout = cast(Rollout, sampler._rollout)
+    rollout = cast(Rollout, sampler.rollout)
     baseline = baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, rollout.returns - baseline)[0].double().cpu()
     wanted = {id(parameter) for parameter in actor_parameters(plain.policy)}

@@ -10,12 +10,12 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import TensorOrDict, select, take
+from sb3_reinforce.common.tensors import TensorOrDict, select, take, to_vector
 from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.updates import Seen, Update
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import flat, scored_parameters
+from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -57,12 +57,12 @@ class PitfallCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model = cast(REINFORCE, self.model)
-        rollout = self.rollout = cast(Rollout, model._rollout)
+        rollout = self.rollout = cast(Rollout, model.rollout)
         self.parameters = self.parameters or scored_parameters(rollout)
         log_prob = self.log_prob(rollout)
         weights = training_weights(model) * rollout.discounts
         weighed = (log_prob * weights[rollout.used][: len(log_prob)].to(log_prob)).sum()
-        gradient = flat(th.autograd.grad(weighed, self.parameters))
+        gradient = to_vector(th.autograd.grad(weighed, self.parameters))
         self.before, self.gradient = log_prob.detach(), gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
 
     def _on_rollout_start(self) -> None:

@@ -7,10 +7,9 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.common.optimization import in_a_row
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import take
-from sb3_reinforce.estimation.scores import flat, score_parameters
+from sb3_reinforce.common.tensors import take, to_vector
+from sb3_reinforce.estimation.scores import score_parameters
 from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
 
 # Draws behind a frequency or a mean action, and for observations of more elements than LARGE
@@ -96,7 +95,7 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, 
     gradient = th.cat(
         [th.zeros_like(p).flatten() if g is None else g.flatten() for p, g in zip(parameters, found, strict=True)]
     ).double()
-    theta = in_a_row(parameters)
+    theta = to_vector(parameters)
     directions = th.nn.functional.normalize(th.randn(n_directions, len(theta), device=theta.device))
     errors = []
     # In float32 the rounding of log π and the third derivative are usually in balance near eps^(1/3), the first
@@ -193,8 +192,8 @@ def closeness_after_step(
     """
     parameters = score_parameters(policy, take(obs, th.arange(1)), action[None])
     log_prob, _ = log_prob_and_entropy(policy, take(obs, th.arange(1)), action[None])
-    gradient = flat(th.autograd.grad(log_prob.sum(), parameters))
-    theta = in_a_row(parameters)
+    gradient = to_vector(th.autograd.grad(log_prob.sum(), parameters))
+    theta = to_vector(parameters)
     # To first order, log π(a|s) rises by this much
     step = 0.3 * gradient / gradient.square().sum().clamp(min=1e-12)
     results, seed = [], int(th.randint(2**31, ()))

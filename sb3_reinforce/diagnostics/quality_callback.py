@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.optimization import in_a_row
+from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.diagnostics.baseline_gradients import gradient_blocks
 from sb3_reinforce.diagnostics.comparisons import functions_of
 from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
@@ -83,9 +83,9 @@ class GradientQualityCallback(BaseCallback):
         if isinstance(model, FiniteDifference):
             theta = model.theta
         else:
-            rollout = cast(Rollout, cast(REINFORCE, model)._rollout)
+            rollout = cast(Rollout, cast(REINFORCE, model).rollout)
             self.parameters = self.parameters or scored_parameters(rollout)
-            theta = in_a_row(self.parameters)
+            theta = to_vector(self.parameters)
         self.thetas, self.n_rollouts = [*self.thetas[-2:], theta], self.n_rollouts + 1
         if self.n_rollouts % self.every == 0:
             figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)

@@ -4,10 +4,11 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
-from sb3_reinforce.common.optimization import in_a_row
-from sb3_reinforce.common.tensors import stack
+from sb3_reinforce.common.arguments import check_function
+from sb3_reinforce.common.tensors import stack, to_vector
 from sb3_reinforce.diagnostics.policy_errors import relative
 from sb3_reinforce.diagnostics.sampling import Infos, training_weights
+from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.reinforce import REINFORCE
@@ -69,7 +70,7 @@ def weight_error(sampler: REINFORCE, rollout: Rollout) -> float:
     :param sampler: The model that collected
     :param rollout: What it collected
     """
-    expected = (rollout.returns - sampler._weighing.baseline(rollout).cpu()) * rollout.used
+    expected = (rollout.returns - check_function("baseline", sampler.baseline, BASELINES)(rollout).cpu()) * rollout.used
     return relative(training_weights(sampler), expected)
 
 
@@ -81,11 +82,11 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     :param sampler: The model that collected; its policy is trained
     :param rollout: What it collected
     """
-    expected = gradients_by_episode(rollout, training_weights(sampler) * rollout.discounts)[0].sum(
-        0
-    ) / sampler._denominator(rollout)
+    expected = (
+        gradients_by_episode(rollout, training_weights(sampler) * rollout.discounts)[0].sum(0) / rollout.denominator
+    )
     parameters = scored_parameters(rollout)
-    before = in_a_row(parameters)
+    before = to_vector(parameters)
     # As long as θ, where the gradient is shorter: a short step would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     sampler.policy.optimizer = th.optim.SGD(sampler.policy.parameters(), lr=rate)
@@ -94,4 +95,4 @@ def surrogate_error(sampler: REINFORCE, rollout: Rollout) -> float:
     sampler.critic_learning_rate, sampler.normalize_advantage, sampler._sorted_parameters = 0.0, False, ()
     sampler._make_critic_optimizer()
     sampler.train()
-    return relative(in_a_row(parameters) - before, rate * expected)
+    return relative(to_vector(parameters) - before, rate * expected)

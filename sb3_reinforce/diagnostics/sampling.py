@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.reinforce import REINFORCE
@@ -52,8 +53,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     sampler, _ = sampled(model, n_episodes, baseline)
-    assert sampler._rollout is not None
-    return sampler._rollout
+    assert sampler.rollout is not None
+    return sampler.rollout
 
 
 def sampled(
@@ -118,7 +119,8 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     try:
         if normalize is not None:
             normalize.training = False
-        yield
+        with guard(env):
+            yield
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     except Exception:
@@ -178,4 +180,4 @@ def training_weights(model: REINFORCE) -> th.Tensor:
     :param model: A model that has collected a rollout
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    return th.as_tensor(by_step(model.rollout_buffer, model.rollout_buffer.advantages)).double()
+    return th.as_tensor(by_step(model.rollout_buffer)[0]).double()

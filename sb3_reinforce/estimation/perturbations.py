@@ -83,3 +83,18 @@ PERTURBATIONS: dict[str, Perturbation] = {
     "rademacher": rademacher,
     "sphere": sphere,
 }
+
+# More perturbations cost more than rough gradients and more updates do
+MAX_DEFAULT_N_DELTA = 64
+# The utility of a policy near zero does not tell smaller perturbations from none
+MIN_DEFAULT_DELTA_STD = 0.05
+
+
+def default_n_delta(estimator: object, n_parameters: int) -> int:
+    """``min(2n, 64)`` perturbations for the regression and ``min(n, 64)`` for the others: as many as determine ĝ."""
+    return min(2 * n_parameters if estimator == "regression" else n_parameters, MAX_DEFAULT_N_DELTA)
+
+
+def default_delta_std(theta: th.Tensor) -> float:
+    """``max(‖θ‖ / 100, 0.05)``."""
+    return max(0.01 * float(theta.norm()), MIN_DEFAULT_DELTA_STD)

@@ -8,7 +8,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions, zeros
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, reached
+from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -25,7 +25,7 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     log_std = getattr(policy, "log_std", None)
     searched = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
     policy.set_training_mode(False)
-    in_actor = reached(log_prob_and_entropy(policy, obs, actions)[0], searched)
+    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], searched)
     parameters = [parameter for parameter, actor in zip(searched, in_actor, strict=True) if actor]
     if not parameters:
         raise ValueError(

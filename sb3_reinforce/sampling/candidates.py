@@ -18,8 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_reinforce.envs.checks import all_finite, is_finite, told
-from sb3_reinforce.envs.stepping import stepper
+from sb3_reinforce.envs.checks import all_finite, format_number, is_finite
 from sb3_reinforce.sampling.candidate_actors import MatrixActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
@@ -106,7 +105,7 @@ class Slots:
             return
         bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
         for i in np.flatnonzero(bad).tolist():
-            raise ValueError(f"{name} of {self.describe(i)} is not finite: {told(values[i])}. {UNCHANGED}")
+            raise ValueError(f"{name} of {self.describe(i)} is not finite: {format_number(values[i])}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """
@@ -165,7 +164,7 @@ def evaluate(
     :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
     """
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
-    returns, step = np.zeros((len(thetas), n_episodes)), stepper(env)
+    returns = np.zeros((len(thetas), n_episodes))
     for queue in queues(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         slots = Slots(queue, env.num_envs, max_episode_steps)
         obs = start(env, slots.pairs, seeds)
@@ -175,7 +174,7 @@ def evaluate(
             if begun:
                 actor.assign(begun, thetas[[slots.pairs[i][0] for i in begun]])
                 begun = []
-            new_obs, rewards, dones, infos = step(actor.act(obs))
+            new_obs, rewards, dones, infos = env.step(actor.act(obs))
             obs = new_obs
             slots.add(rewards if original is None else original(), new_obs)
             finished = dones & slots.active

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_reinforce.common.search_settings import check_candidates
+from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import MatrixActor
 from sb3_reinforce.sampling.candidates import Step, evaluate
 from sb3_reinforce.sampling.normalization import Observed

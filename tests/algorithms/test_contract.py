@@ -536,7 +536,7 @@ class Reused(VecEnvWrapper):
 def test_a_vec_env_may_reuse_its_array_of_dones():
     env = Reused(make_vec_env(lambda: Corridor((3,)), 2))
     model = REINFORCE("MlpPolicy", env, n_steps=9).learn(18)
-    assert model._rollout.dones[:, 0].tolist() == [False, False, True] * 3
+    assert model.rollout.dones[:, 0].tolist() == [False, False, True] * 3
 
 
 class OwnAdd(RolloutBuffer):

@@ -1,7 +1,5 @@
 """FiniteDifference as an algorithm of Stable-Baselines3: counts, callbacks, going on, and what may go wrong."""
 
-import os
-import threading
 import warnings
 from collections import deque
 from functools import partial
@@ -25,7 +23,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.estimation.estimators import central_difference
@@ -354,58 +352,6 @@ def test_a_perturbation_and_an_estimator_of_the_user() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "error", "match"),
-    [
-        (dict(estimator="backward"), ValueError, "estimator must be .*'central'.* got 'backward'"),
-        (dict(estimator=3), TypeError, "estimator must be a name or a callable, got 3"),
-        (dict(perturbation="cube"), ValueError, "perturbation must be .*'sphere'.* got 'cube'"),
-        (dict(n_delta=0), ValueError, "n_delta must be at least 1, got 0"),
-        (dict(n_delta=1, estimator="regression"), ValueError, "n_delta must be at least 2, got 1"),
-        (dict(n_delta=2.0), TypeError, "n_delta must be an integer, got 2.0"),
-        (dict(delta_std=0), ValueError, "delta_std must be finite and > 0, got 0"),
-        (dict(delta_std=float("nan")), ValueError, "delta_std must be finite and > 0, got nan"),
-        (dict(delta_std=lambda progress: 1 - progress), ValueError, "delta_std .at progress 1. must be finite and > 0"),
-        (
-            dict(delta_std=lambda progress: 2 * progress - 1),
-            ValueError,
-            "delta_std .at progress 0. must be finite and >= 0",
-        ),
-        (dict(n_eval_episodes=0), ValueError, "n_eval_episodes must be at least 1, got 0"),
-        (dict(max_episode_steps=0), ValueError, "max_episode_steps must be at least 1, got 0"),
-        (dict(learning_rate=-1), ValueError, "learning_rate must be finite and >= 0 and <= 1e.06, got -1"),
-        (dict(max_grad_norm=0), ValueError, "max_grad_norm must be finite and > 0, got 0"),
-        (dict(n_top=4), ValueError, "n_top=4 needs an n_delta of at least that, got n_delta=3"),
-        (dict(n_top=1, estimator="forward"), ValueError, "n_top=1 needs estimator='central'"),
-        (dict(policy="NoPolicy"), ValueError, "NoPolicy"),
-        (dict(policy=th.nn.Linear), TypeError, "policy must be a name or a subclass of ActorCriticPolicy"),
-    ],
-)
-def test_bad_arguments_are_named(kwargs: dict[str, Any], error: type[Exception], match: str) -> None:
-    with pytest.raises(error, match=match):
-        make(**kwargs)
-
-
-def test_bad_arguments_of_learn_are_named() -> None:
-    for kwargs in (dict(total_timesteps=float("nan")), dict(total_timesteps=10, log_interval=0)):
-        with pytest.raises(ValueError, match=str(list(kwargs)[-1])):
-            make().learn(**kwargs)
-
-
-@pytest.mark.parametrize(
-    "space", [spaces.Tuple([spaces.Discrete(2)]), spaces.Text(3), spaces.Sequence(spaces.Discrete(2))]
-)
-def test_unsupported_spaces_are_an_error(space: spaces.Space) -> None:
-    class Odd(Line):
-        pass
-
-    for name in ("observation_space", "action_space"):
-        env = Odd()
-        setattr(env, name, space)
-        with pytest.raises(ValueError, match=f"{name.split('_')[0]} space must be"):
-            make(DummyVecEnv([lambda env=env: env]) if name == "action_space" else env)
-
-
-@pytest.mark.parametrize(
     ("kwargs", "match"),
     [
         (dict(estimator=lambda u, t, d: t[:1]), r"estimator must return a tensor of shape \(8,\), got .*\(1,\)"),
@@ -429,87 +375,6 @@ def test_what_a_user_returns_wrongly_is_named_and_theta_stays(kwargs: dict[str, 
     with pytest.raises(ValueError, match=match):
         model.learn(100)
     assert th.equal(model.theta, theta) and model._n_updates == 0
-
-
-class Failing(gym.Wrapper):
-    """Goes wrong in the given way at its 100th step."""
-
-    def __init__(self, env: gym.Env, how: str):
-        super().__init__(env)
-        self.how, self.steps = how, 0
-
-    def step(self, action: Any) -> Any:
-        obs, reward, *rest = super().step(action)
-        self.steps += 1
-        if self.steps == 100:
-            if self.how == "interrupt":
-                raise KeyboardInterrupt
-            if self.how == "exception":
-                raise RuntimeError("the simulator broke")
-            return obs, np.nan, *rest
-        return obs, reward, *rest
-
-
-@pytest.mark.parametrize(
-    ("how", "error"), [("interrupt", KeyboardInterrupt), ("exception", RuntimeError), ("nan", ValueError)]
-)
-def test_theta_is_the_last_good_one_after_a_failure_and_can_be_saved(
-    how: str, error: type[BaseException], tmp_path: Any
-) -> None:
-    env = VecNormalize(make_vec_env("CartPole-v1", 1, wrapper_class=Failing, wrapper_kwargs=dict(how=how)))
-    model = make(env)
-    callback = Recorder()
-    with pytest.raises(error):
-        model.learn(10_000, callback)
-    assert th.equal(model.theta, callback.centre) and env.training
-    model.save(tmp_path / "model")
-    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, callback.centre)
-    assert model.learn(200).num_timesteps >= 200
-
-
-class Dying(gym.Wrapper):
-    """Ends its process in the middle of its 20th step."""
-
-    steps = 0
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        if self.steps == 20:
-            os._exit(1)
-        return super().step(action)
-
-
-@pytest.mark.parametrize("in_a_step", [True, False])
-@pytest.mark.parametrize("dead", [0, 1])
-@pytest.mark.parametrize("start_method", ["forkserver", "fork"])
-def test_a_dead_worker_ends_training_promptly(start_method: str, dead: int, in_a_step: bool, tmp_path: Any) -> None:
-    env_fns = [lambda: gym.make("CartPole-v1")] * 2
-    if in_a_step:
-        env_fns[dead] = lambda: Dying(gym.make("CartPole-v1"))
-    with warnings.catch_warnings():
-        # Python warns of fork beside threads; here it is what is tested
-        warnings.simplefilter("ignore", DeprecationWarning)
-        env = SubprocVecEnv(env_fns, start_method=start_method)
-    model = make(env)
-
-    class Kill(BaseCallback):
-        def _on_step(self) -> bool:
-            if self.n_calls == 20:
-                env.processes[dead].kill()
-                env.processes[dead].join()
-            return True
-
-    # Were it to hang, this would end the wait, with an error of another kind
-    watchdog = threading.Timer(60, env.processes[1 - dead].kill)
-    watchdog.start()
-    with pytest.raises(ConnectionError, match=f"worker of environment {dead} died"):
-        model.learn(10_000, Kill())
-    assert watchdog.is_alive()
-    watchdog.cancel()
-    model.save(tmp_path / "model")
-    assert th.equal(FiniteDifference.load(tmp_path / "model").theta, model.theta)
-    env.processes[1 - dead].kill()
-    env.closed = True
 
 
 def test_policy_kwargs_are_not_written_to() -> None:

@@ -1,4 +1,6 @@
-"""Arguments that both algorithms have: each wrong one is named, at construction, by load, by set_env and by learn."""
+"""Each argument is checked at construction, by load, by set_env and by learn; the error names it."""
+
+from inspect import signature
 
 import gymnasium as gym
 import numpy as np
@@ -10,28 +12,114 @@ from models import KINDS, make
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.common import arguments
+from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARGUMENTS, REINFORCE_ARGUMENTS
+
 NAN, INF = float("nan"), float("inf")
+TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
 both = pytest.mark.parametrize("kind", ["steps", "search"])
 
-AT_CONSTRUCTION = {
-    "learning_rate": (-1e-3, NAN, INF, 1e7, "x", None, lambda progress: NAN, lambda progress: np.ones(2)),
-    "max_grad_norm": (0, -1, NAN),
-    "max_episode_steps": (0, NAN),
-    "seed": (-1, 1.5, "x", 2**32),
-    "stats_window_size": (0, -1, NAN),
-    "policy_kwargs": (3, "x"),
-    "tensorboard_log": (3,),
-    "verbose": ("x", None, -1),
-    "device": ("gpu9", 3),
+NO_NUMBERS = ["x", True, [1], 1j, None]
+WRONG = {
+    "check_number": [*NO_NUMBERS, NAN, INF, -INF],
+    "CheckedSchedule": [*NO_NUMBERS, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
+    "check_integer": [*NO_NUMBERS, NAN, INF, 2.5, 2**63],
+    "check_flag": ["no", 1, None],
+    "check_choice": ["batch", 3, None],
+    "check_name": [3, None, b"mean"],
+    "check_kind": [3, [1]],
+    "check_subclass": [3, "x", dict],
+    "check_device": ["gpu9", 3],
+    "check_policy": [3, None],
+    "check_callback": [3, "x", [3], BaseCallback, [BaseCallback]],
 }
 
 
+def wrong_values(check):
+    """What an entry of a table must refuse: values of other types, and those just out of its range."""
+    keywords = getattr(check, "keywords", {})
+    if "check" in keywords:
+        return [value for value in wrong_values(keywords["check"]) if value is not None]
+    values = list(WRONG[getattr(check, "func", check).__name__])
+    if "low" in keywords:
+        values += [keywords["low"] - 0.1, keywords["low"] - 1]
+    if "high" in keywords:
+        values.append(keywords["high"] * 1.1)
+    if keywords.get("above"):
+        values.append(keywords["low"])
+    return values
+
+
+def test_the_tables_name_all_arguments():
+    for algorithm, table in TABLES.items():
+        assert signature(algorithm).parameters.keys() == table.keys() | {"env", "_init_setup_model"}
+        assert list(signature(algorithm.learn).parameters)[1:] == list(LEARN_ARGUMENTS)
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [(each, name) for each, table in TABLES.items() for name in table])
+def test_a_wrong_argument_is_named_with_its_value(algorithm, name):
+    for value in wrong_values(TABLES[algorithm][name]):
+        with pytest.raises((TypeError, ValueError), match=name) as error:
+            algorithm(**{"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu", name: value})
+        assert callable(value) or str(value) in str(error.value)
+
+
 @both
-@pytest.mark.parametrize(("name", "values"), AT_CONSTRUCTION.items())
-def test_what_both_algorithms_take_is_checked_at_construction(kind, name, values):
-    for value in values:
+@pytest.mark.parametrize("name", LEARN_ARGUMENTS)
+def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
+    model = make(kind)
+    for value in wrong_values(LEARN_ARGUMENTS[name]):
         with pytest.raises((TypeError, ValueError), match=name):
-            make(kind, **{name: value})
+            model.learn(**{"total_timesteps": 8, name: value})
+    assert model._last_obs is None and model.num_timesteps == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "words"),
+    [
+        ("steps", {"baseline": "average"}, ["baseline", "'average'", "'leave_one_out'", "'optimal'", "'time_mean'"]),
+        ("search", {"estimator": "backward"}, ["estimator", "'backward'", "'central'"]),
+        ("search", {"perturbation": "cube"}, ["perturbation", "'cube'", "'sphere'"]),
+        ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
+        ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
+        ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
+        ("episodes", {"baseline": "optimal", "n_episodes": 1}, ["n_episodes", "at least 2", "'optimal'", "other"]),
+        ("episodes", {"baseline": "leave_one_out", "n_episodes": 1}, ["at least 2", "'leave_one_out'", "other"]),
+        ("steps", {"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
+        ("steps", {"env": "Pendulum-v1", "temperature": 0.5}, ["temperature", "Box"]),
+        ("steps", {"env": "Pendulum-v1", "temperature": lambda progress: 1.0}, ["temperature", "Box"]),
+        ("steps", {"use_sde": True}, ["gSDE"]),
+        ("search", {"estimator": "regression", "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
+        ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),
+        ("search", {"n_top": 1, "estimator": "forward"}, ["n_top=1", "'central'", "'forward'"]),
+        ("search", {"policy": th.nn.Linear}, ["policy", "ActorCriticPolicy", "Linear"]),
+    ],
+)
+def test_arguments_that_do_not_go_together(kind, wrong, words):
+    with pytest.raises((ValueError, TypeError)) as error:
+        make(kind, **wrong)
+    assert all(word in str(error.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("check", "wrong", "allowed"),
+    [
+        (arguments.number(), INF, "finite"),
+        (arguments.number(0), -1, "finite and >= 0"),
+        (arguments.number(0, above=True), 0, "finite and > 0"),
+        (arguments.number(0, 1), 2, r"in \[0, 1\]"),
+        (arguments.schedule(0, 1, above=True), 0.0, r"in \(0, 1\]"),
+        (arguments.integer(2), 1, "at least 2"),
+        (arguments.integer(2, 5), 6, "at least 2 and at most 5"),
+        (arguments.schedule(), "1e-3", "a number or a schedule"),
+        (arguments.choice("a", "b"), "c", "one of 'a', 'b'"),
+        (arguments.kind(int, str), None, "int or str"),
+    ],
+)
+def test_the_message_says_what_is_allowed(check, wrong, allowed):
+    with pytest.raises((TypeError, ValueError), match=f"^x must be {allowed}, got {wrong!r}"):
+        check("x", wrong)
 
 
 @both
@@ -41,17 +129,42 @@ def test_forms_that_stand_for_the_value_of_a_schedule(form, kind):
     assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
 
 
-@pytest.mark.parametrize("name", ["common_random_numbers", "standardize_utilities", "deterministic"])
-def test_flags_of_the_search(name):
-    for value in ("no", 1, None):
-        with pytest.raises(TypeError, match=name):
-            make("search", **{name: value})
+@pytest.mark.parametrize(("kind", "name"), [("steps", "temperature"), ("search", "delta_std")])
+def test_a_schedule_may_fall_to_an_excluded_bound_but_not_start_there(kind, name):
+    for schedule in (lambda progress: 0.0, lambda progress: 1 - progress):
+        with pytest.raises(ValueError, match=rf"{name} \(at progress 1\) must be (in \(0|finite and > 0)"):
+            make(kind, **{name: schedule})
+    with pytest.raises(ValueError, match=rf"{name} \(at progress 0\) must be (in \[0|finite and >= 0)"):
+        make(kind, **{name: lambda progress: 2 * progress - 1})
+    make(kind, **{name: lambda progress: progress}).learn(8)
 
 
-@pytest.mark.parametrize(("name", "value"), [("rollout_buffer_class", 3), ("rollout_buffer_kwargs", 3)])
-def test_the_rollout_buffer(name, value):
-    with pytest.raises(TypeError, match=name):
-        make("steps", **{name: value})
+def test_a_schedule_that_goes_wrong_later_stops_training_before_a_step():
+    model = make("steps", learning_rate=lambda progress: NAN if 0 < progress < 0.6 else 1e-3)
+    with pytest.raises(ValueError, match="learning_rate"):
+        model.learn(16)
+    assert model._n_updates == 0
+
+
+def test_a_schedule_is_called_once_where_its_value_is_needed_once():
+    seen = []
+    model = make("steps", ent_coef=lambda progress: seen.append(progress) or 0.0)
+    n_before = len(seen)
+    model.learn(80)
+    assert len(seen) - n_before == model._n_updates == 10
+
+
+@both
+def test_a_callback_may_replace_a_schedule(kind):
+    name = "ent_coef" if kind == "steps" else "delta_std"
+
+    class Replace(BaseCallback):
+        def _on_step(self):
+            setattr(self.model, name, "x")
+            return True
+
+    with pytest.raises(TypeError, match=f"{name} must be a number or a schedule"):
+        make(kind, **{name: 0.1}).learn(1000, Replace())
 
 
 @both
@@ -61,33 +174,6 @@ def test_env_must_be_an_environment(kind, env):
         make(kind, env)
     with pytest.raises(TypeError, match="env must be"):
         make(kind).set_env(env)
-
-
-@both
-@pytest.mark.parametrize("policy", [3, None])
-def test_policy_must_be_a_name_or_a_class(kind, policy):
-    with pytest.raises(TypeError, match="policy must be"):
-        make(kind, policy=policy)
-
-
-AT_LEARN = {
-    "total_timesteps": (NAN, INF, -5, "many", None, True),
-    "log_interval": (0, -1, 1.5, "x"),
-    "callback": (3, "x", [3], BaseCallback, [BaseCallback]),
-    "tb_log_name": (3, None),
-    "reset_num_timesteps": ("no", None),
-    "progress_bar": ("no", 1),
-}
-
-
-@both
-@pytest.mark.parametrize(("name", "values"), AT_LEARN.items())
-def test_the_arguments_of_learn(kind, name, values):
-    model = make(kind)
-    for value in values:
-        with pytest.raises((TypeError, ValueError), match=name):
-            model.learn(**{"total_timesteps": 8, name: value})
-    assert model._last_obs is None and model.num_timesteps == 0
 
 
 @both
@@ -104,6 +190,7 @@ def test_learning_after_a_load_needs_an_environment(kind, tmp_path):
 def test_load_checks_the_arguments_that_it_replaces(kind, tmp_path):
     make(kind).save(tmp_path / "model")
     wrong = {"learning_rate": NAN, "seed": -1, "max_grad_norm": -1, "verbose": "x", "gama": 0.9, "stats_window_size": 5}
+    wrong |= {"gamma": 2.0, "n_episodes": 4, "baseline": "x"} if kind == "steps" else {"estimator": "x", "n_top": 9}
     for name, value in wrong.items():
         with pytest.raises((TypeError, ValueError), match=name):
             KINDS[kind][0].load(tmp_path / "model", **{name: value})
@@ -111,7 +198,7 @@ def test_load_checks_the_arguments_that_it_replaces(kind, tmp_path):
 
 
 @both
-def test_load_replaces_arguments_that_a_subclass_hands_on(kind, tmp_path):
+def test_load_replaces_arguments_of_a_subclass_and_those_that_were_not_saved(kind, tmp_path):
     algorithm = KINDS[kind][0]
 
     class Own(algorithm):
@@ -119,7 +206,7 @@ def test_load_replaces_arguments_that_a_subclass_hands_on(kind, tmp_path):
             super().__init__(*args, **kwargs)
             self.own = own
 
-    Own("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
+    Own("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model", exclude=["max_grad_norm"])
     loaded = Own.load(tmp_path / "model", max_grad_norm=0.1, own=2, device="cpu")
     assert type(loaded) is Own and (loaded.max_grad_norm, loaded.own) == (0.1, 2)
     with pytest.raises(TypeError, match="gama"):
@@ -152,33 +239,7 @@ def test_set_env_checks_the_number_and_the_spaces(kind):
 
 
 @both
-@pytest.mark.parametrize(
-    ("policy", "space"),
-    [
-        ("MlpPolicy", spaces.Box(0, 1, (0,))),
-        ("MlpPolicy", spaces.Box(0, 1, (3, 0))),
-        ("MultiInputPolicy", spaces.Dict({})),
-        ("MultiInputPolicy", spaces.Dict(a=spaces.Box(0, 1, (0,)))),
-        ("MlpPolicy", spaces.Tuple([spaces.Discrete(2)])),
-        ("MlpPolicy", spaces.Discrete(4, start=2)),
-    ],
-)
-def test_an_observation_space_that_no_policy_can_see(kind, policy, space):
-    class Env(Corridor):
-        observation_space = property(lambda self: space, lambda self, space: None)
-
-    with pytest.raises(ValueError, match="observation space"):
-        make(kind, Env(), policy)
-
-
-@both
-def test_an_action_space_without_actions(kind):
-    with pytest.raises(ValueError, match="action space"):
-        make(kind, Corridor(action_space=spaces.Box(-1, 1, (0,))))
-
-
-@both
-def test_integers_of_numpy_and_ones_that_are_too_large(kind, tmp_path):
+def test_integers_of_numpy(kind, tmp_path):
     integers = {"seed": 3, "stats_window_size": 5, "max_episode_steps": 600}
     integers |= {"batch_size": 16, "n_steps": 8, "n_critic_updates": 2} if kind == "steps" else {"n_delta": 2}
     model = make(kind, **{name: np.int64(value) for name, value in integers.items()}).learn(16)
@@ -186,37 +247,58 @@ def test_integers_of_numpy_and_ones_that_are_too_large(kind, tmp_path):
     model.save(tmp_path / "model")
     given = {name: np.int64(value) for name, value in integers.items() if name != "stats_window_size"}
     type(model).load(tmp_path / "model", env=gym.make("CartPole-v1"), **given).learn(16)
-    for name in integers.keys() - {"seed", "stats_window_size"}:
-        with pytest.raises(ValueError, match=rf"{name} must be at least .* and at most \d+, got {2**63}"):
-            make(kind, **{name: 2**63})
 
 
-def test_a_temperature_beyond_float32():
-    with pytest.raises(ValueError, match="temperature"):
-        make("steps", temperature=1e300)
+def in_spaces(**changed):
+    """An environment with any spaces."""
+    env = Corridor()
+    for name, space in changed.items():
+        setattr(env, name, space)
+    return env
 
 
 @both
 @pytest.mark.parametrize(
-    "space", [spaces.Box(-1, 1, ()), spaces.MultiDiscrete([[2, 3], [4, 5]]), spaces.Dict({"x": spaces.Box(-1, 1, ())})]
+    ("space", "problem"),
+    [
+        (spaces.Box(0, 1, (3, 0)), "must not be empty"),
+        (spaces.Dict({}), "must not be empty"),
+        (spaces.Dict(a=spaces.Box(0, 1, (0,))), "under 'a' must not be empty"),
+        (spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
+        (spaces.Text(3), "must be Box"),
+        (spaces.Discrete(4, start=2), "must start at 0"),
+        (spaces.MultiDiscrete([2, 2], start=[0, 1]), "must start at 0"),
+        (spaces.Box(-1, 1, ()), "must have a dimension"),
+        (spaces.Dict(x=spaces.Box(-1, 1, ())), "under 'x' must have a dimension"),
+        (spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
+    ],
 )
-def test_observations_of_a_number_of_dimensions_that_no_policy_can_see(space, kind):
-    env = Corridor()
-    env.observation_space = space
+def test_an_observation_space_that_no_policy_can_see(kind, space, problem):
     policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
-    with pytest.raises(ValueError, match=r"observation space.* must have (a|one) dimension"):
-        make(kind, env, policy)
+    with pytest.raises(ValueError, match=f"observation space {problem}"):
+        make(kind, in_spaces(observation_space=space), policy)
 
 
 @both
-def test_actions_of_two_dimensions(kind):
-    env = Corridor()
-    env.action_space = spaces.MultiDiscrete([[2, 3], [4, 5]])
-    with pytest.raises(ValueError, match="MultiDiscrete action space must have one dimension"):
-        make(kind, env)
+@pytest.mark.parametrize(
+    ("space", "problem"),
+    [
+        (spaces.Box(-1, 1, (0,)), "must not be empty"),
+        (spaces.Box(-np.inf, np.inf, (2,)), "must have finite bounds"),
+        (spaces.MultiBinary([2, 3]), "must have one dimension"),
+        (spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
+        (spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
+        (spaces.Dict(a=spaces.Discrete(2)), "must be Box"),
+    ],
+)
+def test_an_action_space_that_no_policy_can_act_in(kind, space, problem):
+    with pytest.raises(ValueError, match=f"action space {problem}"):
+        make(kind, in_spaces(action_space=space))
 
 
 @both
-def test_a_policy_for_dicts_needs_them(kind):
+def test_a_policy_goes_with_its_observations(kind):
     with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
         make(kind, Corridor(), "MultiInputPolicy")
+    with pytest.raises(ValueError, match="MultiInputPolicy"):
+        make(kind, in_spaces(observation_space=spaces.Dict(a=spaces.Box(0, 1))))

@@ -1,141 +1,16 @@
 """A user's mistake gets an error that names the argument, its value and what is allowed, and nothing is lost."""
 
-import os
-import signal
-import threading
-
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
-from gymnasium import spaces
 from models import make, plain
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_reinforce import REINFORCE
 
 NAN, INF = float("nan"), float("inf")
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    {
-        "learning_rate": (-1e-3, NAN, INF, "fast", None),
-        "n_steps": (0, -5, 2.5, NAN, "many", True),
-        "n_episodes": (0, -1, 1.5, INF),
-        "gamma": (-0.1, 1.1, NAN, INF, None),
-        "gae_lambda": (-0.1, 1.1, NAN),
-        "ent_coef": (-0.1, NAN, INF, "auto"),
-        "vf_coef": (-0.5, NAN, INF),
-        "max_grad_norm": (0, -1, NAN, INF),
-        "n_critic_updates": (0, -1, 1.5),
-        "batch_size": (0, -1, 0.5, NAN),
-        "critic_learning_rate": (-1e-3, NAN, INF),
-        "temperature": (0, -1.0, NAN, INF),
-        "min_std": (-0.1, NAN, INF),
-        "max_episode_steps": (0, -1, NAN),
-        "normalize_by": ("batch", 3),
-        "sde_sample_freq": (-2, 1.5),
-        "stats_window_size": (0, -1, NAN),
-        "seed": (-1, 1.5, "x"),
-        "reward_to_go": ("no", 1),
-        "discount_scores": ("no", None),
-        "normalize_advantage": ("no",),
-    }.items(),
-)
-def test_an_argument_out_of_its_range_is_named_with_its_value(name, values):
-    for value in values:
-        with pytest.raises((ValueError, TypeError), match=name) as error:
-            REINFORCE("MlpPolicy", "CartPole-v1", **{name: value})
-        assert str(value) in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["learning_rate", "critic_learning_rate", "ent_coef", "temperature"])
-@pytest.mark.parametrize("schedule", [lambda progress: NAN, lambda progress: -1.0, lambda progress: "x"])
-def test_a_schedule_that_returns_nonsense_is_named(name, schedule):
-    with pytest.raises((ValueError, TypeError), match=name):
-        REINFORCE("MlpPolicy", "CartPole-v1", **{name: schedule})
-
-
-@pytest.mark.parametrize("schedule", [lambda progress: 0.0, lambda progress: 1 - progress])
-def test_a_schedule_may_fall_to_an_excluded_bound_but_not_begin_there(schedule):
-    with pytest.raises(ValueError, match=r"temperature \(at progress 1\) must be finite and > 0"):
-        REINFORCE("MlpPolicy", "CartPole-v1", temperature=schedule)
-
-
-def test_a_schedule_that_goes_wrong_later_stops_training_before_a_step():
-    model = REINFORCE(
-        "MlpPolicy", "CartPole-v1", n_steps=8, learning_rate=lambda progress: NAN if 0 < progress < 0.6 else 1e-3
-    )
-    with pytest.raises(ValueError, match="learning_rate"):
-        model.learn(16)
-    assert model._n_updates == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"baseline": "average"}, ["baseline", "'average'", "'leave_one_out'", "'optimal'", "'time_mean'"]),
-        ({"baseline": 3}, ["baseline", "3", "callable"]),
-        ({"n_steps": 8, "n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
-        ({"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
-        ({"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
-        ({"baseline": "optimal", "n_episodes": 1}, ["n_episodes", "at least 2", "1"]),
-        ({"baseline": "leave_one_out", "n_episodes": 1}, ["n_episodes", "at least 2", "1"]),
-        ({"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
-    ],
-)
-def test_arguments_that_do_not_go_together(arguments, words):
-    with pytest.raises((ValueError, TypeError)) as error:
-        REINFORCE("MlpPolicy", "CartPole-v1", **arguments)
-    assert all(word in str(error.value) for word in words)
-
-
-def test_temperature_is_for_discrete_actions():
-    for temperature in (0.5, lambda progress: 1.0):
-        with pytest.raises(ValueError, match=r"temperature.*Box"):
-            REINFORCE("MlpPolicy", "Pendulum-v1", temperature=temperature)
-
-
-def test_load_checks_what_it_brings(tmp_path):
-    REINFORCE("MlpPolicy", "CartPole-v1", n_steps=8).save(tmp_path / "model")
-    for arguments in ({"gamma": 2.0}, {"n_episodes": 4}, {"baseline": "x"}, {"batch_size": 0}):
-        with pytest.raises(ValueError, match=next(iter(arguments))):
-            REINFORCE.load(tmp_path / "model", **arguments)
-
-
-@pytest.mark.parametrize("arguments", [{"total_timesteps": NAN}, {"total_timesteps": -1}, {"log_interval": 0}])
-def test_learn_checks_its_arguments(arguments):
-    model = REINFORCE("MlpPolicy", "CartPole-v1")
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        model.learn(**{"total_timesteps": 10, **arguments})
-
-
-@pytest.mark.parametrize(
-    "action_space",
-    [
-        spaces.Tuple([spaces.Discrete(2)]),
-        spaces.Box(-np.inf, np.inf, (2,)),
-        spaces.MultiBinary([2, 3]),
-        spaces.Dict({"a": spaces.Discrete(2)}),
-    ],
-)
-def test_an_action_space_that_no_policy_can_act_in(action_space):
-    with pytest.raises(ValueError, match="action space"):
-        REINFORCE("MlpPolicy", Corridor(action_space=action_space))
-
-
-def test_a_discrete_observation_must_start_at_zero():
-    for shifted in (spaces.Discrete(4, start=2), spaces.MultiDiscrete([2, 2], start=[0, 1])):
-
-        class Shifted(Corridor):
-            observation_space = property(lambda self, space=shifted: space, lambda self, space: None)
-
-        with pytest.raises(ValueError, match="start at 0"):
-            REINFORCE("MlpPolicy", Shifted())
 
 
 @pytest.mark.parametrize(
@@ -154,24 +29,6 @@ def test_a_users_baseline_is_checked(baseline, error, words):
     assert "baseline" in str(caught.value) and all(word in str(caught.value) for word in words)
 
 
-class Faulty(Corridor):
-    """Goes wrong at one step: a reward, an observation, or an exception."""
-
-    def __init__(self, fault, at=21, value=NAN, action_space=None, length=7, truncate=False):
-        super().__init__((length,), action_space=action_space, truncate=truncate)
-        self.fault, self.at, self.value, self.n = fault, at, value, 0
-
-    def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        if self.n == self.at:
-            if self.fault == "exception":
-                raise OSError("the simulator has gone")
-            reward = self.value if self.fault == "reward" else reward
-            obs = obs * self.value if self.fault == "observation" else obs
-        self.n += 1
-        return obs, reward, terminated, truncated, info
-
-
 def parameters_of(model):
     return [parameter.clone() for parameter in model.policy.parameters()]
 
@@ -185,44 +42,6 @@ def assert_saveable_and_trainable(model, path):
     assert all(parameter.isfinite().all() for parameter in loaded.policy.parameters())
     model.set_env(Corridor((7,), action_space=model.action_space))
     model.learn(64, reset_num_timesteps=False)
-
-
-@pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 2, "baseline": "none"}])
-@pytest.mark.parametrize("action_space", [spaces.Discrete(2), spaces.Box(-1, 1, (2,))])
-@pytest.mark.parametrize(
-    ("fault", "value"), [("reward", NAN), ("reward", -INF), ("observation", NAN), ("observation", INF)]
-)
-def test_data_that_are_not_finite_are_named_before_the_parameters_are_touched(
-    fault, value, action_space, mode, tmp_path
-):
-    model = REINFORCE("MlpPolicy", Faulty(fault, value=value, action_space=action_space), **mode)
-    updates = []
-
-    class Watch(BaseCallback):
-        def _on_step(self):
-            return True
-
-        def _on_rollout_end(self):
-            updates.append(parameters_of(self.model))
-
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=f"{fault} of environment 0 at step"):
-        model.learn(200, callback=Watch())
-    assert model._n_updates == len(updates)
-    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-    assert_saveable_and_trainable(model, tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    ("length", "truncate", "name"), [(8, True, "terminal observation"), (100, False, "observation")]
-)
-def test_the_last_observation_of_a_rollout_is_checked_too(length, truncate, name):
-    """Of the very last rollout, in which the critic's value of it would end up in the returns."""
-    env = Faulty("observation", at=7, length=length, truncate=truncate)
-    model = REINFORCE("MlpPolicy", env, n_steps=8)
-    before = parameters_of(model)
-    with pytest.raises(ValueError, match=name):
-        model.learn(8)
-    assert all(map(th.equal, before, model.policy.parameters()))
 
 
 def test_a_gradient_that_is_not_finite_is_refused(tmp_path):
@@ -274,14 +93,6 @@ def test_an_interrupt_leaves_the_last_parameters(error, mode, tmp_path):
     assert_saveable_and_trainable(model, tmp_path / "model")
 
 
-def test_an_exception_of_the_environment_passes_and_leaves_the_last_parameters(tmp_path):
-    model = REINFORCE("MlpPolicy", Faulty("exception"), n_steps=8)
-    with pytest.raises(OSError, match="the simulator has gone"):
-        model.learn(100)
-    assert model.num_timesteps == 21 and model._n_updates == 2
-    assert_saveable_and_trainable(model, tmp_path / "model")
-
-
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
     from sb3_reinforce.policies.evaluation import floor_std, set_temperature
 
@@ -289,45 +100,6 @@ def test_temperature_needs_an_action_net_and_min_std_a_log_std():
         set_temperature(th.nn.Linear(1, 1), 0.5)
     with pytest.raises(ValueError, match="log_std"):
         floor_std(th.nn.Linear(1, 1), 0.1)
-
-
-def test_mlp_policy_cannot_take_dicts():
-    class Dicts(Corridor):
-        observation_space = property(lambda self: spaces.Dict({"a": spaces.Box(0, 1)}), lambda self, space: None)
-
-    with pytest.raises(ValueError, match="MultiInputPolicy"):
-        REINFORCE("MlpPolicy", Dicts())
-
-
-def test_gsde_is_for_box_actions():
-    with pytest.raises(ValueError, match="gSDE"):
-        REINFORCE("MlpPolicy", gym.make("CartPole-v1"), use_sde=True)
-
-
-@pytest.mark.parametrize("start_method", ["fork", "forkserver"])
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_worker_that_dies_is_named_at_once(start_method, tmp_path):
-    """Also with fork, where the other worker holds its pipe open and a plain step would wait for ever."""
-    env = SubprocVecEnv([lambda: gym.make("CartPole-v1")] * 2, start_method=start_method)
-    model = REINFORCE("MlpPolicy", env, n_steps=8)
-
-    class Kill(BaseCallback):
-        def _on_step(self):
-            if self.n_calls == 20:
-                os.kill(env.processes[0].pid, signal.SIGKILL)
-                env.processes[0].join()
-            return True
-
-    # A hang would otherwise hold up the whole test run
-    watchdog = threading.Timer(60, env.processes[1].kill)
-    watchdog.start()
-    with pytest.raises(ConnectionError, match="worker of environment 0 died"):
-        model.learn(10_000, Kill())
-    watchdog.cancel()
-    assert env.processes[1].is_alive() and model._n_updates == 2
-    model.save(tmp_path / "model")
-    env.processes[1].kill()
-    env.closed = True
 
 
 # Finite gradients that lead to parameters that are not

@@ -228,7 +228,7 @@ def test_the_model_knows_that_an_episode_begins():
     assert model._last_episode_starts.all()
     assert rollout.timesteps[:, 0].tolist() == [*range(5)] * 3
     model.learn(7, reset_num_timesteps=False)
-    assert model._rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
+    assert model.rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
 
 
 def half(rollout):

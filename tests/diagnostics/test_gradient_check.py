@@ -152,7 +152,7 @@ class WrongReturns(REINFORCE):
 
     def collect_rollouts(self, *args, **kwargs):
         going_on = super().collect_rollouts(*args, **kwargs)
-        self._rollout = replace(self._rollout, returns=self._rollout.returns + self._rollout.rewards)
+        self.rollout = replace(self.rollout, returns=self.rollout.returns + self.rollout.rewards)
         return going_on
 
 

@@ -65,7 +65,7 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, learning_rate: null", "Invalid value for learning_rate: None"),
         ("policy: MlpPolicy, n_timesteps: 100, n_step: 5", "did you mean n_steps"),
         ("policy: MlpPolicy, n_timesteps: 100, seed: 5", "'seed' is not a setting"),
-        ("policy: MlpPolicy, n_timesteps: 100, gamma: 3", "gamma must be finite and >= 0 and <= 1, got 3"),
+        ("policy: MlpPolicy, n_timesteps: 100, gamma: 3", "gamma must be in [0, 1], got 3"),
         ("policy: MlpPolicy, n_timesteps: 100, gamma: x", "gamma must be a number, got 'x' of type str"),
         (
             "policy: MlpPolicy, n_timesteps: 100, policy_kwargs: 'dict('",
