@@ -184,6 +184,8 @@ class FiniteDifference(Persistent):
         if seed is not None:
             self._generator = new_generator()
 
+    is_collecting = False
+
     @property
     def theta(self) -> th.Tensor:
         """θ, a copy of the actor's parameters, shape ``(n,)``, float64."""
@@ -280,6 +282,7 @@ class FiniteDifference(Persistent):
 
         first_seed = int(th.randint(2**31, (), generator=generator))
         self.policy.set_training_mode(False)
+        self.is_collecting = True
         callback.on_rollout_start()
         try:
             with frozen(self._vec_normalize_env) as observed:
@@ -288,6 +291,7 @@ class FiniteDifference(Persistent):
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:
+            self.is_collecting = False
             # The environments are in the middle of episodes, and are reset before they are used again
             self._last_obs = None
         callback.update_locals(locals())

@@ -1,12 +1,16 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
+import copy
 import math
+from collections import deque
+from dataclasses import replace
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -113,6 +117,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     predict = predict
+    is_collecting = False
 
     def __init__(
         self,
@@ -195,6 +200,30 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
     def has_critic(self) -> bool:
         """Whether a critic is trained and used."""
         return self._weighing.has_critic
+
+    # SHIM (drop at the merge): rollout, sampling_copy, is_collecting and Rollout.denominator as PLAN.md names them
+    @property
+    def rollout(self) -> Rollout | None:
+        """The last rollout."""
+        return self._rollout
+
+    @rollout.setter
+    def rollout(self, rollout: Rollout | None) -> None:
+        self._rollout = rollout
+
+    def sampling_copy(self: SelfREINFORCE, n_episodes: int, baseline: str | Baseline | None = None) -> SelfREINFORCE:
+        """A copy that shares policy and environments, and collects whole episodes."""
+        env = cast(VecEnv, self.env)
+        sampler = copy.copy(self)
+        sampler.n_steps, sampler.n_episodes, sampler.is_collecting = None, n_episodes, False  # type: ignore[assignment]
+        sampler.baseline = baseline or ("value" if self.has_critic else "none")
+        sampler._logger = Logger(folder=None, output_formats=[])
+        sampler.ep_info_buffer, sampler.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
+        sampler.rollout_buffer = self.rollout_buffer_class(  # type: ignore[misc]
+            1, env.observation_space, env.action_space, self.device, n_envs=env.num_envs, **self.rollout_buffer_kwargs
+        )
+        sampler._last_obs, sampler._last_episode_starts = None, None
+        return sampler
 
     @property
     def _weighing(self) -> Weighing:
@@ -282,6 +311,7 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
             self._running = Running.none(env.num_envs)
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
+        self.is_collecting = True
         callback.on_rollout_start()
         if n_rollout_steps is None:
             extent = Extent.whole_episodes(cast(int, self.n_episodes), env.num_envs, self.max_episode_steps)
@@ -296,11 +326,13 @@ class REINFORCE(Persistent, OnPolicyAlgorithm):
             self._rollout = weigh(
                 self.policy, rollout_buffer, ends, self._last_obs, extent, self._running, self._weighing
             )
+            self._rollout = replace(self._rollout, denominator=self._denominator(self._rollout))
         except Exception:
             # It may have begun with a number that is not finite: then that is named instead
             check_data(rollout_buffer, self._last_obs, {})
             raise
         finally:
+            self.is_collecting = False
             if self._rollout is None:
                 # A rollout that is broken off is dropped, and the environments are reset before they are used again
                 self._last_obs = None

@@ -1,5 +1,6 @@
 """Helpers for tensors and dicts of tensors."""
 
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -51,3 +52,8 @@ def stack(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
     return np.stack(observations)
+
+
+def to_vector(tensors: Iterable[th.Tensor]) -> th.Tensor:
+    """A copy of all elements as one vector, shape ``(n,)``, in any memory format."""
+    return th.cat([tensor.detach().flatten() for tensor in tensors])

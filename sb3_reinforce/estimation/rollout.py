@@ -43,6 +43,7 @@ class Rollout:
     discounts: th.Tensor
     values: th.Tensor | None
     policy: ActorCriticPolicy
+    denominator: int = 1
 
     @property
     def episodes(self) -> th.Tensor:
