@@ -15,14 +15,14 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import (
     GradientQualityCallback,
-    baseline_gradients,
+    baseline_comparison,
     compare_baselines,
     compare_estimators,
     gradient_statistics,
     gradients_by_episode,
     sample,
 )
-from sb3_reinforce.diagnostics.baseline_gradients import componentwise_residuals, gradient_blocks
+from sb3_reinforce.diagnostics.baseline_comparison import componentwise_residuals, gradient_blocks
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.scores import episode_gradients
 
@@ -182,8 +182,8 @@ def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeyp
             sizes.append(block.numel())
             yield block
 
-    monkeypatch.setattr(baseline_gradients, "gradient_blocks", blocks)
-    found, _ = baseline_gradients.grams(rollout, baselines)
+    monkeypatch.setattr(baseline_comparison, "gradient_blocks", blocks)
+    found, _ = baseline_comparison.gram_matrices(rollout, baselines)
     assert max(sizes) <= max(floats, 5 * 6)
     for name, function in BASELINES.items():
         gradients = gradients_by_episode(rollout, rollout.returns - function(rollout))[0].double()
@@ -228,7 +228,7 @@ def test_the_model_knows_that_an_episode_begins():
     assert model._last_episode_starts.all()
     assert rollout.timesteps[:, 0].tolist() == [*range(5)] * 3
     model.learn(7, reset_num_timesteps=False)
-    assert model._rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
+    assert model.rollout.timesteps[:, 0].tolist() == [0, 1, 2, 3, 4, 0, 1]
 
 
 def half(rollout):

@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
-from sb3_reinforce.diagnostics.rollout_errors import return_by_definition
+from sb3_reinforce.diagnostics.gradient_check import return_by_definition
 from sb3_reinforce.estimation.returns import lambda_return
 
 ACTION_SPACES = [
@@ -152,7 +152,7 @@ class WrongReturns(REINFORCE):
 
     def collect_rollouts(self, *args, **kwargs):
         going_on = super().collect_rollouts(*args, **kwargs)
-        self._rollout = replace(self._rollout, returns=self._rollout.returns + self._rollout.rewards)
+        self.rollout = replace(self.rollout, returns=self.rollout.returns + self.rollout.rewards)
         return going_on
 
 

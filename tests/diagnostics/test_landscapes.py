@@ -13,8 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
+from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
-from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
 
 
 def bandit(algorithm=REINFORCE, **kwargs):

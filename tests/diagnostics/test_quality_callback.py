@@ -61,7 +61,7 @@ def test_it_serves_one_model_after_another():
 def test_the_variance_is_that_of_the_episodes_gradients():
     callback = GradientQualityCallback(1)
     model = train(callback, 1, baseline="none", n_episodes=8, learning_rate=0.0)
-    rollout = model._rollout
+    rollout = model.rollout
     gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, rollout.returns)]).double()
     trace = float(gradients.var(0).sum())
     signal = float(gradients.mean(0).square().sum()) - trace / 8
@@ -72,7 +72,7 @@ def test_the_variance_is_that_of_the_episodes_gradients():
 
 def test_the_signal_to_noise_ratio_is_that_of_the_weights_of_training():
     model = train(GradientQualityCallback(1), 1, baseline="mean", n_episodes=8, learning_rate=0.0)
-    rollout = model._rollout
+    rollout = model.rollout
     weights = rollout.returns - rollout.returns[rollout.used].mean()
     gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
     trace = float(gradients.var(0).sum())
@@ -93,10 +93,10 @@ def test_no_baseline_is_given_more_episodes_than_allowed():
 
 def test_no_more_episodes_than_allowed_are_looked_at():
     model = train(timesteps=1, baseline="none", n_episodes=12)
-    few = evenly_spread(model._rollout, 5)
+    few = evenly_spread(model.rollout, 5)
     assert len(th.unique(few.episodes[few.used])) == 5
-    assert few.used.sum() < model._rollout.used.sum()
-    assert evenly_spread(model._rollout, 12) is model._rollout
+    assert few.used.sum() < model.rollout.used.sum()
+    assert evenly_spread(model.rollout, 12) is model.rollout
 
 
 def test_of_finite_differences_it_logs_the_cosine_between_updates():
