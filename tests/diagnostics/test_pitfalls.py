@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from environments import Corridor
 from gymnasium import spaces
-from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -206,17 +205,3 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
         warnings.simplefilter("ignore")
         pytest.importorskip("Box2D")
     assert healthy("LunarLander-v3", 150_000) == ({}, 0)
-
-
-def test_training_is_the_same_with_it():
-    ours, theirs = (
-        REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 4, seed=0), seed=0, device="cpu").learn(1024, callback)
-        for callback in (PitfallCallback(), None)
-    )
-    for with_it, without in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
-        assert th.equal(with_it, without)
-
-
-def test_other_models_are_refused():
-    with pytest.raises(TypeError, match="must be a REINFORCE"):
-        A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, PitfallCallback())
