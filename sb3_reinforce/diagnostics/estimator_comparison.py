@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.common.search_settings import default_delta_std, default_n_delta
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_independent, collect_episodes, env_of, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
 from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.estimators import ESTIMATORS
-from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.parameters import actor_parameters
