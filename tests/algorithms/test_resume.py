@@ -65,7 +65,8 @@ def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
     model = make(kind, env, seed=3, **schedules)
     # With two environments, in the first rollout of the second half
     model.learn(TOTAL, At(TOTAL // 4 + 1))
-    assert TOTAL // 2 < model.num_timesteps < TOTAL and model._n_updates > 0 and env.ret_rms.count > TOTAL // 2
+    assert TOTAL // 2 < model.num_timesteps < TOTAL and model._n_updates > 0
+    assert kind == "search" or env.ret_rms.count > TOTAL // 2
     model.save(tmp_path / "model")
     env.save(tmp_path / "statistics.pkl")
     here = Path(__file__)
