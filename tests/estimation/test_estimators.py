@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_reinforce.estimation.estimators import (
+from sb3_reinforce.estimation import (
     ESTIMATORS,
     Utility,
     central_difference,
     fit_quality,
     forward_difference,
+    gaussian,
     regression_gradient,
 )
-from sb3_reinforce.estimation.perturbations import gaussian
 
 N = 5
 SEEDS = pytest.mark.parametrize("seed", range(20))
@@ -73,15 +73,6 @@ def test_regression_on_mirrored_perturbations_is_the_central_difference(seed: in
     th.testing.assert_close(mirrored, central_difference(utility, theta, deltas))
 
 
-def test_known_gradients() -> None:
-    two = th.tensor([2.0]).double()
-    square = central_difference(lambda x: (x**2).sum(-1), two, th.tensor([[0.1]]).double())
-    th.testing.assert_close(square, th.tensor([4.0]).double())
-    theta, deltas = normal(1, N, seed=0)[0], normal(2 * N, N, seed=1)
-    for estimator in (central_difference, lambda *args: regression_gradient(*args[:2], th.cat([args[2], -args[2]]))):
-        th.testing.assert_close(estimator(lambda x: -(x**2).sum(-1), theta, deltas), -2 * theta)
-
-
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(name: str) -> None:
     utility, slope = linear(0)
@@ -118,12 +109,9 @@ def test_n_top_is_the_central_difference_of_the_best_perturbations() -> None:
         return x.exp().sum(-1)
 
     best = th.maximum(utility(deltas), utility(-deltas)).argsort(descending=True)[:2]
-    th.testing.assert_close(
-        central_difference(utility, theta, deltas, n_top=2), central_difference(utility, theta, deltas[best])
-    )
-    th.testing.assert_close(
-        central_difference(utility, theta, deltas, n_top=6), central_difference(utility, theta, deltas)
-    )
+    for n_top, rows in ((2, deltas[best]), (6, deltas)):
+        estimate = central_difference(utility, theta, deltas, n_top=n_top)
+        th.testing.assert_close(estimate, central_difference(utility, theta, rows))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -136,7 +124,7 @@ def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(nam
         ESTIMATORS[name](utility, th.zeros(N).double(), equal)
 
 
-def test_fit_quality_is_that_of_a_textbook_regression() -> None:
+def test_fit_quality_is_a_textbook_regressions() -> None:
     m = 400
     slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]
     utilities = 3 + deltas @ slope + 0.5 * noise
