@@ -39,8 +39,8 @@ class BasePolicyGradient(BaseAlgorithm):
     _instead: ClassVar[Mapping[str, str]] = {}
     _random_state: bytes
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
-        # Python itself would only call these arguments unexpected; a subclass may have them
+    def __new__(cls: type[Model], *args: Any, **kwargs: Any) -> Model:
+        # Where Python would only say that an argument is unexpected; a subclass may have it
         accepted = {name for each in cls.__mro__ for name in signature(each.__init__).parameters}  # type: ignore[misc]
         for name in kwargs.keys() & cls._instead.keys() - accepted:
             raise TypeError(f"{cls.__name__} has no argument {name}: {cls._instead[name]}")
@@ -55,7 +55,7 @@ class BasePolicyGradient(BaseAlgorithm):
         if needs_env or env is not None:
             env = check_env(env, verbose)
         if policy_kwargs is not None:
-            # Algorithms write to it
+            # Stable-Baselines3 writes to it
             kwargs["policy_kwargs"] = dict(policy_kwargs)
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)

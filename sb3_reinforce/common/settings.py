@@ -48,7 +48,7 @@ ONE_STEP = "it takes one policy step per rollout, which max_grad_norm alone boun
 OPTIMIZER = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead
 INSTEAD_OF_PPO = {
-    "n_epochs": "it takes one policy step per rollout; n_critic_updates are the passes of the critic",
+    "n_epochs": "it takes one policy step per rollout; n_critic_updates is the number of the critic's passes",
     "clip_range": ONE_STEP,
     "clip_range_vf": ONE_STEP,
     "target_kl": ONE_STEP,
@@ -67,12 +67,14 @@ def check_policy(name: str, value: Any) -> Any:
 
 
 def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
-    """Check that a policy is one that the algorithm can train: a class, or a name that it knows."""
+    """Check that the algorithm knows the name of a policy, or can train its class."""
+    if policy in known or policy in known.values():
+        return
     names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
     for name, remedy in CONTRIB_POLICIES.items():
         if name in names:
             raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {remedy}")
-    if isinstance(policy, str) and policy not in known:
+    if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 
 
