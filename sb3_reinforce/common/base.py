@@ -26,6 +26,10 @@ Model = TypeVar("Model", bound="BasePolicyGradient")
 LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"}
 
 
+# What a state dict of either algorithm may have
+STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
+
+
 class BasePolicyGradient(BaseAlgorithm):
     """
     What both algorithms have in common besides the mathematics: saving and loading change everything or nothing.
@@ -189,9 +193,9 @@ class BasePolicyGradient(BaseAlgorithm):
         From a file only tensors are read (``weights_only``): no code in it is run.
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
-        :param exact_match: Whether there must be a state for everything that has one here. If not, some may be missing,
-            such as an A2C's or PPO's for the critic's optimizer, and the state of another kind of optimizer is left
-            out, with a warning
+        :param exact_match: Whether there must be a state for everything that has one here, and nothing else. If not,
+            some may be missing, FiniteDifference leaves out REINFORCE's ``critic_optimizer``, and the state of another
+            kind of optimizer is left out, with a warning
         :param device: Device on which the parameters are loaded
         :raises TypeError: If a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
@@ -203,13 +207,14 @@ class BasePolicyGradient(BaseAlgorithm):
             check_archive(states, ("policy.pth",))
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
         names = self._get_torch_save_params()[0]
-        if not states.keys() <= set(names) or (exact_match and len(states) < len(names)):
+        allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
+        if not states.keys() <= allowed or (exact_match and len(states) < len(names)):
             raise ValueError(
                 f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing "
                 f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
             )
-        own = dict(states)
-        for name, state in states.items():
+        own = {name: states[name] for name in names if name in states}
+        for name, state in list(own.items()):
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
             part = recursive_getattr(self, name)
@@ -221,7 +226,7 @@ class BasePolicyGradient(BaseAlgorithm):
                 del own[name]
                 warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=2)
         # A mask that a user's policy adds to its logits may well be infinite
-        check_finite(states, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
+        check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
         try:
             super().set_parameters(own, exact_match, device)
