@@ -82,7 +82,7 @@ class FiniteDifference(BasePolicyGradient):
     :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
         ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``
     :param deterministic: Whether candidates take their most likely actions, or sample
-    :param max_grad_norm: Bound on the norm of a step's gradient; None for no bound
+    :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
     :param max_episode_steps: The length beyond which an episode counts as one that never ends
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
@@ -103,8 +103,10 @@ class FiniteDifference(BasePolicyGradient):
     }
     policy: ActorCriticPolicy
     _arguments = FINITE_DIFFERENCE_ARGUMENTS
+    _own_argument = "standardize_utilities"
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
+    _maybe_recommend_cpu = cast(Any, OnPolicyAlgorithm._maybe_recommend_cpu)
 
     def __init__(
         self,
@@ -170,6 +172,8 @@ class FiniteDifference(BasePolicyGradient):
         policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         self.policy = policy.to(self.device)
         n_parameters = self.n_parameters
+        if policy_class in (ActorCriticPolicy, LinearPolicy):
+            self._maybe_recommend_cpu(policy_class.__name__)
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, n_parameters)
         if self._generator is None:
