@@ -264,9 +264,9 @@ class FiniteDifference(BasePolicyGradient):
         :raises Stopped: If the callback returns False
         :raises ValueError: As ``learn``
         """
+        callback.on_rollout_start()
         self.is_collecting = True
         try:
-            callback.on_rollout_start()
             searched = self._find_parameters()
             theta = parameters.read(searched)
             delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
