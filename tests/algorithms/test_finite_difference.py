@@ -209,13 +209,6 @@ def test_schedules_end_at_zero_and_never_below() -> None:
     assert 0.01 <= scales[-1] < scales[0] == 0.11
 
 
-def test_a_learning_rate_of_zero_leaves_theta_where_it_is() -> None:
-    model = make(learning_rate=0.0)
-    theta = model.theta
-    model.learn(200)
-    assert model._n_updates > 0 and th.equal(model.theta, theta)
-
-
 def test_common_random_numbers_reduce_the_variance_of_the_gradient() -> None:
     shared, own = (
         th.stack([estimate.gradient for estimate in estimates(50, n_delta=2, common_random_numbers=is_shared)])
@@ -435,12 +428,6 @@ def test_what_a_user_returns_wrongly_is_named_and_theta_stays(kwargs: dict[str, 
     with pytest.raises(ValueError, match=match):
         model.learn(100)
     assert th.equal(model.theta, theta) and model._n_updates == 0
-
-
-def test_policy_kwargs_are_not_written_to() -> None:
-    policy_kwargs = dict(optimizer_class=th.optim.SGD)
-    make(policy_kwargs=policy_kwargs)
-    assert policy_kwargs == dict(optimizer_class=th.optim.SGD)
 
 
 @pytest.mark.slow

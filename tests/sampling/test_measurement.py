@@ -1,12 +1,17 @@
 """Measurements in a model's environments: the model then goes on as if nothing had happened."""
 
+import os
+import signal
 from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from models import KINDS, Scaled, make, plain
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce.diagnostics import compare_estimators, landscape
@@ -57,6 +62,22 @@ def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: typ
             assert self.model._last_episode_starts.all()
 
     model.learn(20, First(), reset_num_timesteps=False)
+
+
+class Interrupted(ActorCriticPolicy):
+    """Ctrl-C comes in the middle of a candidate's action."""
+
+    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        os.kill(os.getpid(), signal.SIGINT)
+        return super()._predict(observation, deterministic)
+
+
+def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
+    model = PPO(Interrupted, "CartPole-v1", n_steps=8, device="cpu")
+    before = plain(model.policy.state_dict())
+    with pytest.raises(KeyboardInterrupt):
+        landscape(model, n_points=2, n_episodes=1)
+    assert plain(model.policy.state_dict()) == before and model._last_obs is None
 
 
 @pytest.mark.parametrize("kind", KINDS)
