@@ -24,7 +24,8 @@ Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 UNCHANGED = "The policy is the one before this update."
 
 
-@dataclass(frozen=True)
+# Not frozen: one is made at each step, which would take three times as long
+@dataclass
 class CandidateStep:
     """One step of all environments; ``finished`` is True where an episode of a candidate ended."""
 

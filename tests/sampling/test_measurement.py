@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from models import KINDS, Scaled, make, plain
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -73,7 +73,7 @@ class Interrupted(ActorCriticPolicy):
 
 
 def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
-    model = PPO(Interrupted, "CartPole-v1", n_steps=8, device="cpu")
+    model = A2C(Interrupted, "CartPole-v1", device="cpu")
     before = plain(model.policy.state_dict())
     with pytest.raises(KeyboardInterrupt):
         landscape(model, n_points=2, n_episodes=1)
