@@ -74,20 +74,22 @@ class Replacement:
     """Stands for a method of one VecEnv; a copy of the VecEnv has ``before``, the method in whose place this is."""
 
     def __init__(self, method: Callable[[], Any], before: Callable[[], Any]):
-        self.method, self.before = method, before
+        self.method = method
+        self.before = before
 
     def __call__(self) -> Any:
         return self.method()
 
     def __reduce__(self) -> tuple[Any, ...]:
+        # A function that returns its second argument
         return cast, (object, self.before)
 
 
 def replace(stack: ExitStack, env: VecEnv, name: str, method: Callable[[], Any]) -> None:
     """Put ``method`` in the place of a method of this instance until the stack is left."""
-    own, replacement = vars(env), Replacement(method, getattr(env, name))
+    own = vars(env)
     before = own.get(name)
-    own[name] = replacement
+    own[name] = replacement = Replacement(method, getattr(env, name))
 
     def restore() -> None:
         # A user may have replaced it since, for good

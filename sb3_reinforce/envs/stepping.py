@@ -5,28 +5,37 @@ With 64 CartPoles the deep copies of ``DummyVecEnv.step_wait`` take a fourth of 
 """
 
 from copy import deepcopy
+from traceback import walk_tb
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.envs.checks import as_reward, check_observation
+from sb3_reinforce.envs.checks import BadData, as_reward, check_observation
 
 
 def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     """What ``env.step_wait()`` returns, with shallow copies of the infos: their values are the environment's own."""
-    rewards, dones, infos = env.buf_rews, env.buf_dones, []
+    rewards = env.buf_rews
+    dones = env.buf_dones
+    infos = []
     # One array, unless observations are dicts
     rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
     # The usual observation is written at once; to compare two shapes takes as long as all else here
     is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
-    array, dtype, size = (np.ndarray, rows.dtype, rows.shape[1]) if is_vector else (None, None, 0)
+    dtype = rows.dtype if is_vector else None
+    size = rows.shape[1] if is_vector else 0
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
-        obs, reward, terminated, truncated, info = single.step(action)
+        try:
+            obs, reward, terminated, truncated, info = single.step(action)
+        except (TypeError, ValueError) as error:
+            check_monitor(error, i)
+            raise
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
         if terminated or truncated:
@@ -35,7 +44,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is array and obs.dtype is dtype and obs.ndim == 1 and len(obs) == size:
+        if type(obs) is np.ndarray and obs.dtype is dtype and obs.ndim == 1 and len(obs) == size:
             rows[i] = obs
         else:
             check_observation(env.observation_space, obs, i)
@@ -47,12 +56,21 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     return observations, rewards.copy(), dones.copy(), infos.copy()
 
 
+def check_monitor(error: Exception, i: int) -> None:
+    """Name the reward of environment ``i`` where ``Monitor`` could not add it up."""
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    if frame.f_code is Monitor.step.__code__:
+        reward = frame.f_locals.get("reward")
+        raise BadData(f"The reward of environment {i} must be a number, got {reward!r}: {error}") from error
+
+
 class CheckedReset(gym.Wrapper[Any, Any, Any, Any]):
     """Environment ``i`` of a VecEnv, with a check of its first observation."""
 
     def __init__(self, env: gym.Env[Any, Any], i: int, space: spaces.Space[Any]):
         super().__init__(env)
-        self.i, self.space = i, space
+        self.i = i
+        self.space = space
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """What the environment's reset returns."""

@@ -11,7 +11,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -40,7 +41,8 @@ class GymnasiumVecEnv(VecEnv):
     def __init__(self, env: VectorEnv[Any, Any, Any]):
         if not isinstance(env, VectorEnv):
             raise TypeError(f"env must be a gymnasium.vector.VectorEnv, got {env!r} of type {type(env).__name__}")
-        self.env, self.restart = env, find_restart(env)
+        self.env = env
+        self.restart = find_restart(env)
         self.actions: Any = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -68,7 +70,8 @@ class GymnasiumVecEnv(VecEnv):
         if self.restart is None and ended and "final_obs" not in env_infos:
             raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
         # A copy that has reset itself returns the last step's observation and infos apart from those of the reset
-        last_obs, last_infos = env_infos.pop("final_obs", obs), env_infos.pop("final_info", env_infos)
+        last_obs = env_infos.pop("final_obs", obs)
+        last_infos = env_infos.pop("final_info", env_infos)
         for mask in ("_final_obs", "_final_info"):
             env_infos.pop(mask, None)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -116,7 +119,10 @@ class GymnasiumVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
         """Call a method of the copies; a NotImplementedError says where there are none that could be called."""
-        copies, wanted = getattr(self.env.unwrapped, "envs", None), list(self._get_indices(indices))
+        copies = getattr(self.env.unwrapped, "envs", None)
+        wanted = list(self._get_indices(indices))
+        if isinstance(self.env.unwrapped, AsyncVectorEnv) and method_name == "reset":
+            return reset_copies(self.env.unwrapped, wanted, **kwargs)
         if copies is None and wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
             return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
         if copies is None:
@@ -156,7 +162,18 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
 
 def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: NDArray[np.bool_]) -> Any:
     """Start new episodes where ``ended`` (n_envs,) by Gymnasium's ``reset_mask``."""
-    return env.reset(options={"reset_mask": ended})
+    # The environment takes the mask out of the options, so that this wrapper would clear the counts of all copies
+    counts = []
+    wrapper = env
+    while isinstance(wrapper, VectorWrapper):
+        if isinstance(wrapper, RecordEpisodeStatistics):
+            for name in ("episode_start_times", "episode_returns", "episode_lengths", "prev_dones"):
+                counts.append((wrapper, name, getattr(wrapper, name)))
+        wrapper = wrapper.env
+    obs_and_infos = env.reset(options={"reset_mask": ended})
+    for recorder, name, before in counts:
+        getattr(recorder, name)[~ended] = before[~ended]
+    return obs_and_infos
 
 
 def restart_cart_pole(env: Any, ended: NDArray[np.bool_]) -> Any:
@@ -167,27 +184,32 @@ def restart_cart_pole(env: Any, ended: NDArray[np.bool_]) -> Any:
     return env.state.T.astype(np.float32), {}
 
 
+def reset_copies(env: AsyncVectorEnv, wanted: list[int], seed: int | None = None, options: Any = None) -> list[Any]:
+    """The observation and info of each of the ``wanted`` copies, reset in their processes by ``reset_mask``."""
+    mask = np.isin(np.arange(env.num_envs), wanted)
+    seeds = [seed if is_wanted else None for is_wanted in mask]
+    obs, infos = env.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+    return [(one_of(obs, i), info_of(infos, i)) for i in wanted]
+
+
 def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -> None:
     """Check the form of the observations (n_envs, ...), or a dict of them, and the rewards (n_envs,) of a step."""
     rewards = np.asarray(rewards)
     if rewards.shape != (n_envs,) or rewards.dtype.kind not in "biuf":
         got = f"shape {rewards.shape} and dtype {rewards.dtype}"
         raise BadData(f"The rewards must be {n_envs} numbers, one for each environment, got {got}")
-    parts = obs if isinstance(obs, dict) else {"": obs}
+    parts = {key: np.asarray(part) for key, part in obs.items()} if isinstance(obs, dict) else {"": np.asarray(obs)}
     spaces_of = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     for part in parts.values():
-        if np.shape(part)[:1] != (n_envs,):
-            raise BadData(f"The observations must be those of {n_envs} environments, got shape {np.shape(part)}")
-    # Copy by copy only what is not seen from the batch
-    if not parts.keys() >= spaces_of.keys() or not all(fits(part, parts[key]) for key, part in spaces_of.items()):
+        if part.shape[:1] != (n_envs,):
+            raise BadData(f"The observations must be those of {n_envs} environments, got shape {part.shape}")
+    is_checked = parts.keys() >= spaces_of.keys() and all(
+        type(each) is spaces.Box and has_form(each, parts[key].shape[1:], parts[key].dtype)
+        for key, each in spaces_of.items()
+    )
+    if not is_checked:
         for i in range(n_envs):
             check_observation(space, one_of(obs, i), i)
-
-
-def fits(space: spaces.Space[Any], batch: Any) -> bool:
-    """Whether observations (n_envs, ...) are of the form of a Box."""
-    values = np.asarray(batch)
-    return type(space) is spaces.Box and has_form(space, values.shape[1:], values.dtype)
 
 
 def one_of(obs: Any, i: int) -> Any:

@@ -59,7 +59,7 @@ def complete_rollout(
         rewards=th.as_tensor(rewards).double(),
         dones=th.as_tensor(dones),
         timesteps=th.as_tensor(timesteps),
-        used=th.tensor(used),
+        used=th.as_tensor(used.copy()),
         returns=th.tensor(returns),
         discounts=th.as_tensor(gamma**exponents),
         values=None if next_values is None else th.as_tensor(buffer.values).double(),

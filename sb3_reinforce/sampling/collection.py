@@ -115,6 +115,9 @@ def collect(
             write_row(rollout_buffer.values, n_steps, values)
             write_row(rollout_buffer.log_probs, n_steps, log_probs)
 
+        if model.use_sde:
+            # Its standard deviation may overflow, and the environment would be blamed
+            check_finite("The action", actions, (None,))
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs

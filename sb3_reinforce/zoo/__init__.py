@@ -8,7 +8,12 @@ nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce
 try:
     import rl_zoo3.train
 except ImportError as error:
-    raise ImportError(f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]'") from error
+    # Given its name, `python -m sb3_reinforce.zoo` prints the sentence without a traceback
+    raise ImportError(
+        f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]', or pip install -e '.[zoo]' "
+        "in a clone of the repository",
+        name=__name__,
+    ) from error
 
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params
 
@@ -21,4 +26,5 @@ __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 rl_zoo3.ALGOS.update(ALGORITHMS)
 HYPERPARAMS_SAMPLER.update(reinforce=samplers.sample_reinforce, finite_difference=samplers.sample_finite_difference)
 HYPERPARAMS_CONVERTER.update(reinforce=convert_onpolicy_params, finite_difference=samplers.convert_finite_difference)
+# The command train makes its experiment by this name
 rl_zoo3.train.ExperimentManager = make_experiment  # type: ignore[misc,assignment]

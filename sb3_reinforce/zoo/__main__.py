@@ -1,7 +1,9 @@
 """The RL Zoo's commands, with REINFORCE and FiniteDifference: ``python -m sb3_reinforce.zoo <command> ...``."""
 
 import argparse
+import contextlib
 import importlib
+import io
 import os
 import runpy
 import subprocess
@@ -25,10 +27,8 @@ FUNCTIONS = {
 SCRIPTS = {"record_video": "rl_zoo3.record_video", "benchmark": "rl_zoo3.benchmark"}
 COMMANDS = (*FUNCTIONS, *SCRIPTS)
 CHECKED = ("train", "enjoy", "record_video", "benchmark")
-# Installed with the extra, but not needed by `import rl_zoo3`
-EXTRA = {"matplotlib", "pandas", "requests", "rliable", "scipy", "seaborn"}
 NOT_OFFERED = {
-    "push_to_hub": "the Zoo's push_to_hub cannot be imported with any huggingface_sb3 that it can be installed with",
+    "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
     "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
     "record_training": "record the checkpoints one by one: record_video --load-checkpoint STEPS",
 }
@@ -79,31 +79,55 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -> None:
     """Exit with a sentence for arguments that the Zoo would ignore, or end with a traceback for."""
     known = argparse.ArgumentParser(parser.prog, parser.usage, add_help=False, allow_abbrev=False)
-    for name in ("--env", "--algo", "--storage", "--study-name", "--trial-id"):
+    known.add_argument("--env", default="CartPole-v1")
+    known.add_argument("--algo", default="ppo")
+    known.add_argument("--exp-id", type=int, default=0)
+    for name in ("--storage", "--study-name", "--trial-id", "--load-checkpoint"):
         known.add_argument(name)
-    known.add_argument("-f", "--folder")
+    known.add_argument("-f", "--folder", default="rl-trained-agents")
     known.add_argument("-i", "--trained-agent")
     known.add_argument("--log-dir", default="rl-trained-agents/")
-    known.add_argument("--no-hub", action="store_true")
+    for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
+        known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         known.add_argument(*names, nargs="+", action=StorePython)
     given, _ = known.parse_known_args(arguments)
     if command == "benchmark":
         check_benchmark(parser, given)
         return
-    if given.env is not None and given.env not in gym.registry:
+    if given.algo not in utils.ALGOS:
+        hint = closest(given.algo, utils.ALGOS) or f", only {', '.join(utils.ALGOS)}"
+        parser.error(f"there is no --algo {given.algo}{hint}")
+    if given.env not in gym.registry:
         parser.error(
             f"--env {given.env} is not registered (an environment of another package needs --gym-packages PACKAGE)"
             f"{closest(given.env, gym.registry)}"
         )
+    for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
+        try:
+            if env_kwargs:
+                gym.make(given.env, **env_kwargs).close()
+        except TypeError as error:
+            parser.error(f"{option}: {error}")
     if command != "train":
-        if given.algo in ALGORITHMS and given.folder is None:
-            parser.error(f"there are no published models of {given.algo}: pass the folder of your own, such as -f logs")
+        check_model(parser, command, given)
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
     if given.trained_agent and not (given.trained_agent.endswith(".zip") and os.path.isfile(given.trained_agent)):
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
+
+
+def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.Namespace) -> None:
+    """Exit with a sentence where there is no model, unless it is one that the Zoo downloads."""
+    which = (given.load_best, given.load_checkpoint, given.load_last_checkpoint)
+    try:
+        # The command itself prints the same again
+        with contextlib.redirect_stdout(io.StringIO()):
+            utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env), *which)
+    except (AssertionError, ValueError) as error:
+        if command == "record_video" or given.algo in ALGORITHMS or "rl-trained-agents" not in given.folder:
+            parser.error(f"{error}: pass the folder of your models, such as -f logs, and their --algo and --env")
 
 
 def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -141,9 +165,7 @@ def main() -> None:
         else:
             run_script(command)
     except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        hint = "pip install 'sb3-reinforce[zoo]'" if missing in EXTRA else "install it, or correct the name"
-        parser.error(f"{error}: {hint}")
+        parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))
     except ValueError as error:

@@ -80,18 +80,16 @@ class Experiment(ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found, self.optimize_hyperparameters)
-        self.argument_names |= as_dict("policy_kwargs", found.get("policy_kwargs")).keys()
+        for key in ("policy_kwargs", "env_kwargs"):
+            self.argument_names |= as_dict(key, found.get(key)).keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
         return found, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> tuple[Any, ...]:
-        """
-        Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule.
-
-        The Zoo converts only ``learning_rate`` and ``delta_std``, to a class without which the saved model could not be
-        loaded. No public method stands between its reading of the settings and the model.
-        """
+        """Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule."""
+        # The Zoo converts two of them, to a class without which the saved model could not be loaded. No public method
+        # stands between the settings and the model
         linear = {}
         for key in scheduled_keys(self.algo) & hyperparams.keys():
             if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):

@@ -10,6 +10,7 @@ from environments import Corridor, Faulty
 from gymnasium import spaces
 from models import KINDS, make, plain
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
@@ -223,6 +224,38 @@ def test_rewards_that_are_no_numbers(wrapper, value, kind):
     model = make(kind, WRAPPERS[wrapper](of_two(fault="reward", at=5, value=value)))
     with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
         model.learn(400)
+
+
+@all_kinds
+@pytest.mark.parametrize("value", ["x", np.ones(1), np.ones(2), None], ids=repr)
+def test_rewards_that_monitor_cannot_add_up(value, kind):
+    faults = [{}, dict(fault="reward", at=5, value=value)]
+    env = DummyVecEnv([lambda fault=fault: Monitor(Faulty(**fault)) for fault in faults])
+    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number, got .*\(step 4 since"):
+        make(kind, env).learn(400)
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
+@pytest.mark.parametrize("kind", ["steps", "episodes"])
+def test_actions_that_are_not_finite_are_not_blamed_on_the_environment(kind, wrapper):
+    """The standard deviation of gSDE overflows."""
+    model = make(kind, wrapper(make_vec_env("Pendulum-v1", 2)), use_sde=True)
+    model.policy.log_std.data.fill_(90.0)
+    with pytest.raises(ValueError, match=r"action of environment 0 is not finite.*\(step 0 since"):
+        model.learn(400)
+
+
+class Picky(Corridor):
+    """Refuses an action with an error of its own."""
+
+    def step(self, action):
+        raise TypeError("the action is not to my taste")
+
+
+@all_kinds
+def test_errors_of_an_environment_below_monitor_are_its_own(kind):
+    with pytest.raises(TypeError, match="taste"):
+        make(kind, Picky()).learn(8)
 
 
 @all_kinds

@@ -18,7 +18,7 @@ from zoo_commands import NAMES, RUN, config_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 

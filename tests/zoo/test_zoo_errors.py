@@ -18,7 +18,7 @@ from zoo_commands import message_of, train
 
 from sb3_reinforce.zoo import __main__
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 REINFORCE = ["train", "--algo", "reinforce"]
 
@@ -79,6 +79,7 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
         ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
         ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: 3", "env_kwargs must be a dict, got 3"),
+        ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
         ("policy: MlpPolicy, n_timesteps: 100, frame_stack: a", "frame_stack must be an integer, got 'a'"),
         ("policy: CnnPolicy, n_timesteps: 100", "You should use NatureCNN only with images"),
     ],
@@ -107,7 +108,11 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
     [
         (["fly"], "there is no command 'fly', only train, enjoy"),
         (["push_to_hub"], "push_to_hub is not offered"),
-        (["train", "--algo", "reinforc"], "invalid choice: 'reinforc'"),
+        (["train", "--algo", "reinforced"], "there is no --algo reinforced: did you mean reinforce?"),
+        (["enjoy", "--algo", "x"], "there is no --algo x, only a2c, "),
+        (["train", "--env-kwargs", "gravty:3"], "--env-kwargs: CartPoleEnv.__init__() got an unexpected keyword"),
+        (["enjoy", "--algo", "reinforce", "-f", "logs"], "The logs/reinforce folder was not found: pass the folder"),
+        (["record_video", "-f", ".", "--exp-id", "-1"], "The ./ppo folder was not found: pass the folder"),
         (["train", "--env", "CartPol-v1"], "--gym-packages PACKAGE): did you mean CartPole-v"),
         (["train", "-params", "baseline:none"], "write a text as"),
         (["train", "-params", "n_steps:1/0"], "the value of 'n_steps:1/0' must be Python (ZeroDivisionError"),
@@ -119,7 +124,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
-        (["enjoy", "--algo", "reinforce"], "no published models of reinforce"),
+        (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
         ([*REINFORCE, "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
         (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
         (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
@@ -134,7 +139,7 @@ def test_a_wrong_command_is_answered_with_a_sentence(
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])
-def test_a_benchmark_without_network_is_told_of_no_hub(
+def test_a_benchmark_without_network_says_to_pass_no_hub(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", raising(error))
@@ -164,4 +169,4 @@ def test_a_package_of_the_extra_that_is_missing_is_named(
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "seaborn", None)
     message = message_of(capsys, "plot_train")
-    assert "seaborn" in message and "pip install 'sb3-reinforce[zoo]'" in message
+    assert "seaborn" in message and "[zoo]" in message

@@ -20,7 +20,7 @@ from zoo_commands import RUN, config_of, message_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
