@@ -20,7 +20,7 @@ from sb3_reinforce.sampling.measurement import undisturbed
 MEASUREMENTS: dict[str, Any] = {
     "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
     "compare_estimators": lambda model: compare_estimators(
-        model, n_episodes=3, n_estimates=3, n_delta=2, n_resamples=5, estimators=("likelihood_ratio", "central")
+        model, n_episodes=3, n_estimates=3, n_delta=2, n_resamples=5, estimators=("central", "likelihood_ratio")
     ),
 }
 
