@@ -14,8 +14,8 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.estimation import gradients_by_episode
 from sb3_reinforce.estimation.baselines import BASELINES, none
-from sb3_reinforce.estimation.scores import episode_gradients
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)
@@ -47,7 +47,7 @@ rollout = replace(rollout, values=values)
 traces = {}
 for name, baseline in BASELINES.items():
     weights = rollout.discounts * (rollout.returns - baseline(rollout))
-    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)])
+    gradients = gradients_by_episode(rollout, weights)[0]
     traces[name] = gradients.var(dim=0).sum().item()
 
 print(f"{'baseline':16s} {'trace of the covariance':>24s} {'of none':>8s}")
