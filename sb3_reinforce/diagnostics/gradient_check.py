@@ -1,6 +1,6 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -179,8 +179,8 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
     collector.lr_schedule = FloatSchedule(rate)
-    # No critic is trained now
-    collector.baseline = "none"
+    # Without values no critic is trained
+    collector.rollout = replace(rollout, values=None)
     collector.normalize_advantage = False
     collector.ent_coef = 0.0
     collector.max_grad_norm = None  # type: ignore[assignment]
