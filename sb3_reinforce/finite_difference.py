@@ -14,7 +14,6 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.arguments import check_function
@@ -25,6 +24,7 @@ from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
     Estimator,
+    GradientEstimate,
     central_difference,
     check_deltas,
     check_estimate,
@@ -39,9 +39,10 @@ from sb3_reinforce.estimation.perturbations import (
 )
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.sampling.candidate_actors import LoopActor, make_actor
+from sb3_reinforce.policies.plain_mlp import plain_actor
+from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
 from sb3_reinforce.sampling.normalization import frozen
-from sb3_reinforce.sampling.utility import Stopped, Utility
+from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -155,7 +156,10 @@ class FiniteDifference(BasePolicyGradient):
         self.deterministic = deterministic
         self.max_grad_norm = max_grad_norm
         self.max_episode_steps = max_episode_steps
+        self.is_collecting = False
         self._generator: th.Generator | None = None
+        self._trainable: list[th.nn.Parameter] = []
+        self._searched: list[th.nn.Parameter] = []
         self._warned = False
         if _init_setup_model:
             self._setup_model()
@@ -169,31 +173,35 @@ class FiniteDifference(BasePolicyGradient):
         self.policy = policy.to(self.device)
         if policy_class in (ActorCriticPolicy, LinearPolicy):
             self._maybe_recommend_cpu(policy_class.__name__)
-        self._actor_parameters = parameters.actor_parameters(self.policy)
+        n_parameters = self.n_parameters
         if self.n_delta is None:
-            self.n_delta = default_n_delta(self.estimator, self.n_parameters)
+            self.n_delta = default_n_delta(self.estimator, n_parameters)
         if self._generator is None:
             self._generator = new_generator()
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """
-        Seed the global generators, the environments and the perturbations.
-
-        :param seed: The seed; None changes nothing
-        """
+        """Seed the global generators, the environments and the perturbations; None changes nothing."""
         super().set_random_seed(seed)
         if seed is not None:
             self._generator = new_generator()
 
     @property
     def theta(self) -> th.Tensor:
-        """θ, a copy of the actor's parameters, shape ``(n,)``, float64."""
-        return parameters.read(self._actor_parameters)
+        """θ, a copy of the actor's trainable parameters, shape ``(n,)``, float64."""
+        return parameters.read(self._find_parameters())
 
     @property
     def n_parameters(self) -> int:
         """n, the number of parameters that are searched."""
-        return sum(parameter.numel() for parameter in self._actor_parameters)
+        return sum(parameter.numel() for parameter in self._find_parameters())
+
+    def _find_parameters(self) -> list[th.nn.Parameter]:
+        """The actor's trainable parameters, found by a pass that is made again only if others are trainable now."""
+        trainable = [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
+        if list(map(id, trainable)) != list(map(id, self._trainable)):
+            self._searched = parameters.actor_parameters(self.policy)
+            self._trainable = trainable
+        return self._searched
 
     @guarded
     def learn(
@@ -222,95 +230,96 @@ class FiniteDifference(BasePolicyGradient):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._prepare_search()
+        self._announce_search()
         callback.on_training_start(locals(), globals())
         iteration = 0
         while self.num_timesteps < total_timesteps:
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             try:
-                gradient = self.estimate_gradient(callback)
+                estimate = self.estimate_gradient(callback)
             except Stopped:
                 break
-            self.train(gradient)
+            self.train(estimate)
             iteration += 1
             if log_interval is not None and iteration % log_interval == 0:
                 self.dump_logs(iteration)
         callback.on_training_end()
         return self
 
-    def _prepare_search(self) -> None:
-        """What a run needs besides θ, built anew for each: the actor, and a word on what to expect."""
-        env = cast(VecEnv, self.env)
-        self._actor = make_actor(self.policy, self._actor_parameters, env.num_envs, self.deterministic)
-        if self.verbose >= 1 and isinstance(self._actor, LoopActor):
-            print(f"{type(self.policy).__name__} has code of its own: candidates act one by one, which is slower")
-        n_delta = cast(int, self.n_delta)
-        if self.estimator == "regression" and n_delta <= self.n_parameters and not self._warned:
+    def _announce_search(self) -> None:
+        """Say what makes this search slow or its gradient rough."""
+        if self.verbose >= 1 and plain_actor(self.policy) is None:
+            print(f"{type(self.policy).__name__} is not a plain MLP: candidates act one by one, which is slower")
+        if self.estimator == "regression" and cast(int, self.n_delta) <= self.n_parameters and not self._warned:
             self._warned = True
             warnings.warn(
-                f"n_delta={n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters and "
-                "an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
+                f"n_delta={self.n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters "
+                "and an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer "
+                "parameters",
                 stacklevel=4,
             )
 
-    def estimate_gradient(self, callback: BaseCallback) -> th.Tensor:
+    def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate:
         """
-        Perturb θ, evaluate the candidates and estimate ∇U(θ). Nothing is changed but the count of steps.
+        Perturb θ, evaluate the candidates and estimate ∇U(θ). The policy stays as it is.
 
         :param callback: Called at each step, and at the beginning and end of the rollout
-        :return: ĝ, shape ``(n,)``
+        :return: ĝ, and the evaluations that it was estimated from
         :raises Stopped: If the callback returns False
         :raises ValueError: As ``learn``
         """
-        theta = self.theta
-        self._delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
-        perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
-        n_delta, generator = cast(int, self.n_delta), cast(th.Generator, self._generator)
-        deltas = self._delta_std * check_deltas(perturbation(n_delta, len(theta), generator), n_delta, len(theta))
-        estimator = check_function("estimator", self.estimator, ESTIMATORS)
-        if self.n_top is not None:
-            estimator = partial(central_difference, n_top=self.n_top)
-
-        first_seed = int(th.randint(2**31, (), generator=generator))
-        self.policy.set_training_mode(False)
-        callback.on_rollout_start()
+        self.is_collecting = True
         try:
-            with frozen(self._vec_normalize_env) as observed:
-                utility = self._utility = Utility(self, self._actor, callback, observed, first_seed)
-                gradient = check_estimate(estimator(utility, theta, deltas), len(theta))
+            callback.on_rollout_start()
+            searched = self._find_parameters()
+            theta = parameters.read(searched)
+            delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
+            n = len(theta)
+            n_delta = cast(int, self.n_delta)
+            generator = cast(th.Generator, self._generator)
+            perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
+            deltas = delta_std * check_deltas(perturbation(n_delta, n, generator), n_delta, n)
+            estimator = check_function("estimator", self.estimator, ESTIMATORS)
+            if self.n_top is not None:
+                estimator = partial(central_difference, n_top=self.n_top)
+            first_seed = int(th.randint(2**31, (), generator=generator))
+            self.policy.set_training_mode(False)
+            actor = make_candidate_actor(self.policy, searched, self.n_envs, self.deterministic)
+            with frozen(self.get_vec_normalize_env()) as observed:
+                utility = EpisodicUtility(self, actor, n, callback, observed, first_seed)
+                gradient = check_estimate(estimator(utility, theta, deltas), n)
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:
+            self.is_collecting = False
             # The environments are in the middle of episodes, and are reset before they are used again
             self._last_obs = None
         callback.update_locals(locals())
         callback.on_rollout_end()
-        return gradient
+        return GradientEstimate(gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched)
 
     @uninterrupted
-    def train(self, gradient: th.Tensor) -> None:
+    def train(self, estimate: GradientEstimate) -> None:
         """
         One optimizer step uphill.
 
-        :param gradient: ĝ, shape ``(n,)``
+        :param estimate: What ``estimate_gradient`` returned
         :raises ValueError: If the step is not finite; the parameters are those before it
         """
-        candidates, utilities = th.cat(self._utility.candidates), th.cat(self._utility.values)
-        fit = fit_quality(candidates - self.theta, utilities, gradient)
+        gradient, searched, utilities = estimate.gradient, estimate.parameters, estimate.utilities
+        fit = fit_quality(estimate.candidates, utilities, gradient)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)
         if self.standardize_utilities and utility_std > 0:
-            gradient = gradient * self._delta_std / utility_std
+            gradient = gradient * estimate.delta_std / utility_std
         # The optimizer descends: here, and only here, the sign turns
-        loss_gradient = [part[0] for part in parameters.split(-gradient[None], self._actor_parameters)]
-        with optimization.kept_finite(self.policy.optimizer, self._actor_parameters, "policy"):
-            grad_norm = optimization.step(
-                self.policy.optimizer, self._actor_parameters, loss_gradient, self.max_grad_norm, "utility"
-            )
+        loss_gradient = [part[0] for part in parameters.split(-gradient[None], searched)]
+        with optimization.kept_finite(self.policy.optimizer, searched, "policy"):
+            grad_norm = optimization.step(self.policy.optimizer, searched, loss_gradient, self.max_grad_norm, "utility")
         self._n_updates += 1
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/delta_std", self._delta_std)
+        self.logger.record("train/delta_std", estimate.delta_std)
         self.logger.record("train/grad_norm", grad_norm)
         self.logger.record("train/r_squared", fit.r_squared)
         self.logger.record("train/residual_std", fit.residual_std)
@@ -320,7 +329,7 @@ class FiniteDifference(BasePolicyGradient):
         self.logger.record("rollout/utility_std", utility_std)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_actor_parameters", "_actor", "_utility"]
+        return [*super()._excluded_save_params(), "_trainable", "_searched", "is_collecting"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

@@ -1,11 +1,14 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
+import copy
+from collections import deque
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -16,20 +19,25 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import check_function
-from sb3_reinforce.common.base import BasePolicyGradient
-from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
 from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.estimation.baselines import BASELINES, Baseline
-from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode
-from sb3_reinforce.estimation.weights import Running, Steps, Weighing, used_steps, weigh
-from sb3_reinforce.policies.critic import fit_critic
-from sb3_reinforce.policies.evaluation import Parameters, floor_std, set_temperature, split_parameters
-from sb3_reinforce.policies.policy_step import step_policy
-from sb3_reinforce.sampling.collection import check_data, collect, warn_of_own_methods
+from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
+from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
+from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
+from sb3_reinforce.policies.evaluation import (
+    Parameters,
+    Route,
+    evaluate,
+    floor_std,
+    route_of,
+    set_temperature,
+    split_parameters,
+)
+from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -183,19 +191,17 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.min_std = min_std
         self.max_episode_steps = max_episode_steps
         self.normalize_advantage = normalize_advantage
-        self._rollout: Rollout | None = None
+        #: The last rollout; None before the first one, and after one that was broken off
+        self.rollout: Rollout | None = None
+        #: Whether a rollout is being collected, so that its environments must be left alone
+        self.is_collecting = False
         if _init_setup_model:
             self._setup_model()
 
     @property
     def has_critic(self) -> bool:
         """Whether a critic is trained and used."""
-        return self._weighing.has_critic
-
-    @property
-    def _weighing(self) -> Weighing:
-        baseline = check_function("baseline", self.baseline, BASELINES)
-        return Weighing(baseline, self.gamma, self.gae_lambda, self.reward_to_go, self.discount_scores)
+        return self._function("baseline", BASELINES) is BASELINES["value"]
 
     def _critic_rate(self) -> float:
         name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
@@ -203,8 +209,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         check_reinforce(self, BASELINES)
-        # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout sizes it anew
-        n_steps, self.n_steps = self.n_steps, self.n_steps or 1
+        # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout resizes it
+        n_steps = self.n_steps
+        self.n_steps = n_steps or 1
         super()._setup_model()
         self.n_steps = n_steps
         warn_of_own_methods(self.rollout_buffer)
@@ -215,7 +222,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._apply_temperature_and_floor()
 
     def _make_critic_optimizer(self) -> None:
-        """Over all parameters, of which it is only ever given the gradients of the critic's own."""
+        """An optimizer over all parameters, which only gets the gradients of the critic's."""
         self.critic_optimizer = self.policy.optimizer_class(
             self.policy.parameters(),
             lr=self._critic_rate(),  # type: ignore[call-arg]
@@ -223,9 +230,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         )
         optimization.fuse(self.critic_optimizer)
 
-    def _sort_parameters(self, steps: Steps) -> tuple[Parameters, Parameters, Parameters]:
-        """What log π depends on, what only V depends on, and what both do: found anew where the policy has changed."""
-        if not self.has_critic:
+    def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
+        """What log π depends on, what only V depends on, and what both do; sorted again if the policy has changed."""
+        if rollout.values is None:
             return [parameter for parameter in self.policy.parameters() if parameter.requires_grad], [], []
         trainable = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
         if self._sorted_parameters[:1] != (trainable,):
@@ -233,7 +240,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             if not held >= {number for number, _ in trainable}:
                 self._make_critic_optimizer()
             self.policy.set_training_mode(False)
-            self._sorted_parameters = (trainable, split_parameters(self.policy, steps.observations, steps.actions))
+            self._sorted_parameters = (trainable, split_parameters(self.policy, batch.observations, batch.actions))
         groups: tuple[Parameters, Parameters, Parameters] = self._sorted_parameters[1]
         return groups
 
@@ -245,7 +252,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
     ) -> bool:
         """
-        Collect a rollout with the current policy and weigh its steps.
+        Collect a rollout with the current policy and compute the weights of its steps.
 
         :param env: The training environment
         :param callback: Called at each step, and at the beginning and end of the rollout
@@ -254,45 +261,66 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param n_rollout_steps: Steps per environment, None for whole episodes
         :return: False if the callback stopped the collection; the rollout is then dropped
         :raises ValueError: If a reward, an observation or a baseline is not finite, if no episode ended in a rollout
-            that needs one, or if an episode does not end. The parameters have not been touched, and the environments
-            are reset before they are used again
+            that needs one, or if an episode does not end. The parameters have not changed, and the environments are
+            reset before they are used again
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
         rollout_buffer.reset()
+        if self.use_sde:
+            self.policy.reset_noise(env.num_envs)
+        callback.on_rollout_start()
         if n_rollout_steps is None and not np.all(self._last_episode_starts):
             self._last_obs = env.reset()  # type: ignore[assignment]
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         if np.all(self._last_episode_starts):
             self._running = Running.none(env.num_envs)
-        if self.use_sde:
-            self.policy.reset_noise(env.num_envs)
-        callback.on_rollout_start()
         if n_rollout_steps is None:
             extent = Extent.whole_episodes(cast(int, self.n_episodes), env.num_envs, self.max_episode_steps)
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
-        self._rollout = None
+        route = route_of(self.policy, with_critic=self.has_critic)
+        self.rollout = None
+        self.is_collecting = True
         try:
-            ends = collect(self, env, callback, rollout_buffer, extent, self.has_critic)
-            if ends is None:
+            collected = collect(self, env, callback, rollout_buffer, extent, route)
+            if collected is None:
                 return False
-            check_data(rollout_buffer, self._last_obs, ends.terminal_obs)
-            self._rollout = weigh(
-                self.policy, rollout_buffer, ends, self._last_obs, extent, self._running, self._weighing
+            dones, terminal_obs = collected
+            check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
+            next_values = None
+            if route.with_critic:
+                rollout_buffer.values = values_along(self.policy, route, rollout_buffer)
+                next_values = values_after(
+                    self.policy, route, rollout_buffer.values, dones, self._last_obs, terminal_obs
+                )
+            self.rollout = complete_rollout(
+                rollout_buffer,
+                self.policy,
+                dones,
+                None if n_rollout_steps else extent.quota,
+                self._running,
+                next_values,
+                baseline=self._function("baseline", BASELINES),
+                gamma=self.gamma,
+                gae_lambda=self.gae_lambda,
+                reward_to_go=self.reward_to_go,
+                discount_scores=self.discount_scores,
+                normalize_by=self.normalize_by,
             )
         except Exception:
-            # It may have begun with a number that is not finite: then that is named instead
-            check_data(rollout_buffer, self._last_obs, {})
+            # The cause may be a number that is not finite: then that is reported instead
+            check_rollout_data(rollout_buffer, self._last_obs, {})
             raise
         finally:
-            if self._rollout is None:
-                # A rollout that is broken off is dropped, and the environments are reset before they are used again
+            self.is_collecting = False
+            if self.rollout is None:
+                # The environments stopped in the middle of episodes, and are reset before they are used again
                 self._last_obs = None
-        self._running = self._running.after(rollout_buffer.rewards, ends.dones, self.gamma)
-        self.logger.record("rollout/complete_fraction", float(in_finished_episode(ends.dones).mean()))
+        self._running = self._running.after(rollout_buffer.rewards, dones, self.gamma)
+        self.logger.record("rollout/complete_fraction", float(in_finished_episode(dones).mean()))
         if n_rollout_steps is None:
-            self.logger.record("rollout/used_fraction", float(self._rollout.used.double().mean()))
+            self.logger.record("rollout/used_fraction", float(self.rollout.used.double().mean()))
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -305,44 +333,89 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :raises ValueError: If a gradient is not finite, or a step makes a parameter that is not; the parameters are
             those before that step, or before the critic's passes
         """
-        rollout = cast(Rollout, self._rollout)
-        ent_coef, critic_rate = self._scheduled("ent_coef"), self._critic_rate()
-        steps = used_steps(rollout, self.rollout_buffer, self.normalize_advantage)
-        actor, critic, shared = self._sort_parameters(steps)
+        rollout = cast(Rollout, self.rollout)
+        advantages, returns = by_step(self.rollout_buffer)
+        ent_coef = self._scheduled("ent_coef")
+        critic_rate = self._critic_rate()
+        batch = training_batch(rollout, advantages, returns, self.normalize_advantage)
+        route = route_of(self.policy, with_critic=rollout.values is not None)
+        actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
-        vf_coef = self.vf_coef if shared else None
-        log = step_policy(self.policy, actor, steps, self._denominator(rollout), ent_coef, vf_coef, self.max_grad_norm)
-        # The temperature is that of the progress made, with which a saved model will be loaded
+        log_prob, entropy, values = evaluate(
+            self.policy, route, batch.observations, batch.actions, with_values=bool(shared)
+        )
+        # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
+        # (Williams, 1992, equation 4)
+        policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
+        loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
+        if shared and values is not None:
+            # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
+            loss = loss + self.vf_coef * F.mse_loss(values, batch.returns)
+        grad_norm = 0.0
+        # An actor may be frozen while its critic warms up
+        if actor and loss.requires_grad:
+            gradients = th.autograd.grad(loss, actor, allow_unused=True)
+            with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
+                grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
+        # A model that is saved now will be loaded with the temperature of the progress made
         self._apply_temperature_and_floor()
         self._n_updates += 1
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, value in log.items():
-            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/entropy_loss", -entropy.mean().item())
+        self.logger.record("train/policy_loss", policy_loss.item())
+        self.logger.record("train/grad_norm", grad_norm)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-        if self.has_critic:
-            if shared:
-                # Passes that moved the statistics of what the actor uses too would be a second step of the policy
-                self.policy.set_training_mode(False)
-            if self.policy.share_features_extractor:
-                self.policy.features_extractor.eval()
-            update_learning_rate(self.critic_optimizer, critic_rate)
-            passes = (self.n_critic_updates, self.batch_size, self.max_grad_norm)
-            value_loss = fit_critic(
-                self.policy, self.critic_optimizer, critic, steps.observations, steps.returns, *passes
-            )
-            self.logger.record("train/value_loss", value_loss)
-            variance = explained_variance(cast(th.Tensor, steps.values).numpy(), steps.returns.cpu().numpy())
-            self.logger.record("train/explained_variance", variance)
+        if batch.values is not None:
+            self._train_critic(route, batch, batch.values, critic, bool(shared), critic_rate)
 
-    def _denominator(self, rollout: Rollout) -> int:
-        """The constant ``n_steps * n_envs`` for fixed rollouts, else by ``normalize_by``."""
-        if self.n_steps is not None:
-            return rollout.used.numel()
-        return int(rollout.used.sum()) if self.normalize_by == "steps" else cast(int, self.n_episodes)
+    def _train_critic(
+        self, route: Route, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float
+    ) -> None:
+        """The critic's passes over the rollout; ``values`` are V(s_t) before them."""
+        if is_shared:
+            # Passes that moved statistics of what the actor uses too would be a second step of the policy
+            self.policy.set_training_mode(False)
+        if self.policy.share_features_extractor:
+            self.policy.features_extractor.eval()
+        update_learning_rate(self.critic_optimizer, rate)
+        value_loss = fit_critic(
+            self.policy,
+            route,
+            self.critic_optimizer,
+            critic,
+            batch.observations,
+            batch.returns,
+            self.n_critic_updates,
+            self.batch_size,
+            self.max_grad_norm,
+        )
+        self.logger.record("train/value_loss", value_loss)
+        self.logger.record("train/explained_variance", explained_variance(values.numpy(), batch.returns.cpu().numpy()))
+
+    def sampling_copy(self, n_episodes: int, baseline: str | Baseline | None = None) -> "REINFORCE":
+        """
+        A copy for measurements: it shares policy and environments, and has a log, counters and rollouts apart.
+
+        :param n_episodes: Whole episodes per rollout
+        :param baseline: Its baseline; None for ``"value"`` with a critic, else ``"none"``
+        :return: The copy; ``collect_rollouts`` resets the environments first
+        """
+        model = copy.copy(self)
+        model.n_steps = None  # type: ignore[assignment]
+        model.n_episodes = n_episodes
+        model.baseline = baseline or ("value" if self.has_critic else "none")
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        model.ep_info_buffer = deque(maxlen=1)
+        model.ep_success_buffer = deque(maxlen=1)
+        model.rollout_buffer = self.rollout_buffer_class(  # type: ignore[misc]
+            1, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **self.rollout_buffer_kwargs
+        )
+        model._last_episode_starts = np.zeros(self.n_envs, dtype=bool)
+        return model
 
     @guarded
     def learn(
@@ -376,7 +449,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_sorted_parameters", "_rollout"]
+        return [*super()._excluded_save_params(), "_sorted_parameters", "rollout"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

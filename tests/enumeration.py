@@ -14,11 +14,14 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.rollout import Extent
-from sb3_reinforce.estimation.weights import Running, weigh
-from sb3_reinforce.sampling.collection import Ends
+from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation.rollout import Running
+from sb3_reinforce.estimation.weights import complete_rollout
+from sb3_reinforce.policies.critic import values_after, values_along
+from sb3_reinforce.policies.evaluation import route_of
 
 GAMMA = 0.5
+ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normalize_by")
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
 
 
@@ -79,19 +82,37 @@ def fill(model, batch):
         for t, (node, action, reward) in enumerate(trajectory):
             buffer.observations[t, i], buffer.actions[t, i], buffer.rewards[t, i] = Tree.observe(node), action, reward
         dones[len(trajectory) - 1, i] = True
-    return buffer, Ends(dones, {})
+    return buffer, dones
+
+
+def rollout_of(model, batch):
+    """What the package makes of a batch of episodes: returns, masks, denominator and advantages."""
+    buffer, dones = fill(model, batch)
+    baseline = BASELINES.get(str(model.baseline), model.baseline)
+    next_values = None
+    if model.has_critic:
+        route = route_of(model.policy, with_critic=True)
+        buffer.values = values_along(model.policy, route, buffer)
+        next_values = values_after(model.policy, route, buffer.values, dones, buffer.observations[-1], {})
+    rollout = complete_rollout(
+        buffer,
+        model.policy,
+        dones,
+        np.ones(len(batch), dtype=int),
+        Running.none(len(batch)),
+        next_values,
+        baseline=baseline,
+        **{name: getattr(model, name) for name in ARGUMENTS},
+    )
+    return rollout, baseline(rollout)
 
 
 def estimate(model, batch):
     """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
-    buffer, ends = fill(model, batch)
-    extent = Extent.whole_episodes(len(batch), len(batch), 1000)
-    rollout = weigh(
-        model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(len(batch)), model._weighing
-    )
-    weights = rollout.discounts * (rollout.returns - model._weighing.baseline(rollout)) * rollout.used
+    rollout, baseline = rollout_of(model, batch)
+    weights = rollout.discounts * (rollout.returns - baseline) * rollout.used
     terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
-    return sum(terms) / model._denominator(rollout), int(rollout.used.sum())
+    return sum(terms) / rollout.denominator, int(rollout.used.sum())
 
 
 def expectation(model, trajectories, n_episodes, statistic):

@@ -1,5 +1,8 @@
 """Small tasks whose returns, lengths and gradients are known."""
 
+import os
+import signal
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -84,3 +87,60 @@ class Corridor(gym.Env[np.ndarray, Any]):
 
     def observe(self) -> np.ndarray:
         return np.eye(max(self.lengths) + 1, dtype=np.float32)[self.t, :-1]
+
+
+class Faulty(Corridor):
+    """
+    Episodes of seven steps; does something wrong at one step of its life, or at one reset.
+
+    :param fault: What: "reward", "observation" or "first observation" is ``value``; "raise" or "die", "in step" or "in
+        reset"; or the name of a signal that the learner gets in the middle of a step
+    :param at: When, counted from 1
+    :param value: What is returned then, or raised
+    :param truncate: Whether episodes end by truncation
+    :param observation_space: Its space, if it is another
+    """
+
+    def __init__(
+        self,
+        fault: str = "",
+        at: int = 0,
+        value: Any = None,
+        truncate: bool = False,
+        observation_space: spaces.Space[Any] | None = None,
+    ):
+        super().__init__((7,), truncate=truncate)
+        self.observation_space = observation_space or self.observation_space
+        self.fault, self.at, self.value, self.n_steps, self.n_resets = fault, at, value, 0, 0
+
+    def observe(self) -> np.ndarray:
+        if self.observation_space.shape == (7,):
+            return super().observe()
+        return np.zeros(self.observation_space.shape, self.observation_space.dtype)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        obs, info = super().reset(seed=seed, options=options)
+        self.n_resets += 1
+        if self.n_resets == self.at:
+            self.go_wrong("reset")
+            obs = self.value if self.fault == "first observation" else obs
+        return obs, info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.n_steps += 1
+        if self.n_steps == self.at:
+            self.go_wrong("step")
+            reward = self.value if self.fault == "reward" else reward
+            obs = self.value if self.fault == "observation" else obs
+        return obs, reward, terminated, truncated, info
+
+    def go_wrong(self, when: str) -> None:
+        if self.fault == f"raise in {when}":
+            raise self.value or OSError("the simulator has gone")
+        if self.fault == f"die in {when}":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.fault in signal.Signals.__members__ and when == "step":
+            os.kill(os.getppid(), signal.Signals[self.fault])
+            # The answer comes when the learner has long stopped waiting for it
+            time.sleep(0.2)

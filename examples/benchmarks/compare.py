@@ -39,7 +39,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_reinforce.zoo import ALGORITHMS as OURS
-from sb3_reinforce.zoo import HYPERPARAMS
+from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
 ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "ars")
 SEARCHES = ("finite_difference", "ars")
@@ -77,7 +77,7 @@ def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
 def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
     """A model, its environments and those of its evaluations, with a configuration that no other run shares."""
     with contextlib.redirect_stdout(io.StringIO()):
-        manager = ExperimentManager(
+        manager = (Experiment if run.algorithm in OURS else ExperimentManager)(
             argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
         )
         # Ours are read as by the command train, which leaves out what does not go with the task

@@ -18,8 +18,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.diagnostics import sample
-from sb3_reinforce.diagnostics.bootstrap import resamples
-from sb3_reinforce.diagnostics.comparisons import baseline_rows, compare_baselines, functions_of
+from sb3_reinforce.diagnostics.baseline_comparison import baseline_rows, compare_baselines, functions_of
+from sb3_reinforce.diagnostics.tables import resamples
 from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

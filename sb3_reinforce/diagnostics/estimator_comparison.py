@@ -1,22 +1,25 @@
-"""The families of gradient estimators at one θ: which of them sees the gradient of a task from the fewest steps."""
+"""The families of gradient estimators at one θ: which one detects the gradient of a task in the fewest steps."""
 
+import copy
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.diagnostics.bootstrap import Estimate, interval, resamples
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
-from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
-from sb3_reinforce.diagnostics.moments import cosine, gram, moments, signal_to_noise
-from sb3_reinforce.diagnostics.sampling import check_independent, seeded
-from sb3_reinforce.diagnostics.tables import Table
+from sb3_reinforce.diagnostics.sampling import check_independent, collect_episodes, env_of, seeded
+from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
+from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
+from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.estimators import ESTIMATORS
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
+from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.finite_difference import FiniteDifference
+from sb3_reinforce.policies.parameters import actor_parameters
 from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.sampling.measurement import undisturbed
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
 
@@ -27,10 +30,10 @@ class EstimatorRow:
     One estimator of the gradient of ``U(θ) = E[Σ_t r_t]``.
 
     :param estimator: Its name
-    :param cosine: Cosine of what it estimates to the likelihood-ratio gradient, whose noise is in the interval too
-    :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, by the environment steps behind it
-    :param steps: Environment steps behind one estimate, of all environments
-    :param seconds: Time behind one estimate
+    :param cosine: Cosine of its expectation to the likelihood-ratio gradient; the interval includes the noise of both
+    :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, divided by its environment steps
+    :param steps: Environment steps of one estimate, of all environments together
+    :param seconds: Seconds for one estimate
     """
 
     estimator: str
@@ -53,26 +56,27 @@ def compare_estimators(
     seed: int = 0,
 ) -> Table[EstimatorRow]:
     """
-    Estimate the gradient at the model's θ by each family, with the same sampling policy and γ = 1.
+    Estimate the gradient at the model's θ with each family, with the same sampling policy and γ = 1.
 
-    θ is the actor's parameters without ``log_std``. An estimate is, for the likelihood ratio, one episode with
-    reward-to-go and the leave-one-out baseline; for the others, ``n_delta`` perturbations with one episode each behind
-    a utility. The signal-to-noise ratio of a mean of estimates is proportional to their number, so its ratio to the
-    steps does not depend on how large an estimate is. With fewer perturbations than parameters a difference sees only
-    their span: its expectation is a multiple of the gradient, and the cosine is that of the expectation.
+    θ is the actor's parameters without ``log_std``. One estimate is one episode with reward-to-go and the leave-one-out
+    baseline for the likelihood ratio, and ``n_delta`` perturbations with one episode per utility for the others. The
+    signal-to-noise ratio of a mean of estimates is proportional to their number, so the ratio per step does not depend
+    on the size of an estimate. With fewer perturbations than parameters a difference only sees their span: its
+    expectation is a multiple of the gradient, and the cosine refers to the expectation.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
-    :param n_episodes: Episodes of the likelihood ratio, and as many again for the gradient to compare with, at least 3
-    :param n_estimates: Estimates by each of the others, at least 3; below about 20 the intervals are too narrow
+    :param n_episodes: Episodes of the likelihood ratio, and as many again for the reference gradient, at least 3
+    :param n_estimates: Estimates with each of the others, at least 3; below about 20 the intervals are too narrow
     :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
-    :param perturbation: As for FiniteDifference. As many Gaussian perturbations as parameters are all but dependent,
-        and a difference that is solved for them is mostly noise; coordinates are not
+    :param perturbation: As for FiniteDifference. A difference solved for as many Gaussian perturbations as parameters
+        is mostly noise, because these are nearly linearly dependent; coordinates are not
     :param n_delta: As for FiniteDifference; None for the rule of thumb
-    :param delta_std: As for FiniteDifference, whose rule of thumb None stands for. A single episode behind a utility is
-        too noisy for steps as small as those of training, so that the default is larger
-    :param n_resamples: Bootstrap resamples behind the intervals
-    :param confidence: Probability that an interval is to cover the truth
-    :param seed: Seed of perturbations, episodes (of the environments too) and resamples
+    :param delta_std: As for FiniteDifference; None for its rule of thumb. A utility from a single episode is too noisy
+        for steps as small as in training, so the default is larger
+    :param n_resamples: Number of bootstrap resamples
+    :param confidence: Probability with which an interval should cover the true value
+    :param seed: Seed of perturbations, episodes (also of the environments) and resamples
+    :return: A table with one ``EstimatorRow`` per estimator
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
         episodes are not independent because they share the noise of gSDE
@@ -89,67 +93,84 @@ def compare_estimators(
     check_number("confidence", confidence, 0, 1)
     if n_delta is not None:
         check_integer("n_delta", n_delta, 2)
-    utility = CandidateUtility(model, 1, seed)
+    if delta_std is not None:
+        check_number("delta_std", delta_std, 0, above=True)
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
-    scale = (
-        default_delta_std(utility.theta) if delta_std is None else check_number("delta_std", delta_std, 0, above=True)
-    )
+    utility = CandidateUtility(model, 1, seed)
+    n_parameters = len(utility.theta)
+    scale = default_delta_std(utility.theta) if delta_std is None else delta_std
     generator = th.Generator().manual_seed(seed)
-
-    def difference(name: str) -> Callable[[], tuple[th.Tensor, int]]:
-        k = default_n_delta(name, len(utility.theta)) if n_delta is None else n_delta
-
-        def estimate() -> tuple[th.Tensor, int]:
-            before = utility.n_steps
-            deltas = scale * draw(k, len(utility.theta), generator)
-            return ESTIMATORS[name](utility, utility.theta, deltas), utility.n_steps - before
-
-        return estimate
-
     rows = []
     with seeded(model.policy, seed):
         reference = likelihood_ratio(model, n_episodes)[0]
-        reference_counts = resamples(n_episodes, n_resamples, seed + 1)
         for name in names:
             begin = time.perf_counter()
             if name == LIKELIHOOD_RATIO:
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
-                estimate = difference(name)
-                found, made = zip(*(estimate() for _ in range(n_estimates)), strict=True)
-                gradients, n_steps = th.stack(found), sum(made)
-            seconds, counts = time.perf_counter() - begin, resamples(len(gradients), n_resamples, seed)
+                k = default_n_delta(name, n_parameters) if n_delta is None else n_delta
+                deltas = (scale * draw(k, n_parameters, generator) for _ in range(n_estimates))
+                gradients, n_steps = finite_differences(utility, name, deltas)
+            seconds = (time.perf_counter() - begin) / len(gradients)
             steps = n_steps / len(gradients)
-            rows.append(estimator_row(name, gradients, reference, steps, seconds, counts, reference_counts, confidence))
-    return Table(f"Gradient of U(θ) for {len(utility.theta)} parameters by estimator", rows)
+            to_reference, snr = judge(gradients, reference, n_resamples, confidence, seed)
+            snr_per_step = Estimate(snr.value / steps, snr.low / steps, snr.high / steps)
+            rows.append(EstimatorRow(name, to_reference, snr_per_step, steps, seconds))
+    return Table(f"Gradient of U(θ) for {n_parameters} parameters by estimator", rows)
 
 
-def estimator_row(
-    name: str,
-    gradients: th.Tensor,
-    reference: th.Tensor,
-    steps: float,
-    seconds: float,
-    counts: th.Tensor,
-    reference_counts: th.Tensor,
-    confidence: float,
-) -> EstimatorRow:
+def judge(
+    gradients: th.Tensor, reference: th.Tensor, n_resamples: int, confidence: float, seed: int
+) -> tuple[Estimate, Estimate]:
+    """Cosine of estimates ``(m, n)`` to other gradients ``(m', n)``, and the signal-to-noise ratio of one estimate."""
+    counts = resamples(len(gradients), n_resamples, seed)
+    others = resamples(len(reference), n_resamples, seed + 1)
+    moments = compute_moments(gram(gradients), counts)
+    # ⟨E g, E r⟩ of each pair of resamples
+    products = (counts @ (gradients @ reference.T) * others).sum(1) / (counts.sum(1) * others.sum(1))
+    to_reference = cosine(moments, compute_moments(gram(reference), others), products, confidence)
+    return to_reference, interval(signal_to_noise(moments), confidence)
+
+
+def finite_differences(utility: CandidateUtility, name: str, deltas: Iterable[th.Tensor]) -> tuple[th.Tensor, int]:
+    """One gradient for each of m perturbations ``(k, n)``, shape ``(m, n)``, and the environment steps of all."""
+    before = utility.n_steps
+    gradients = [ESTIMATORS[name](utility, utility.theta, each) for each in deltas]
+    return th.stack(gradients), utility.n_steps - before
+
+
+def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:
     """
-    A row of ``compare_estimators``.
-
-    :param name: The estimator
-    :param gradients: Its m estimates, shape ``(m, n)``, float64
-    :param reference: Likelihood-ratio gradients of other episodes, shape ``(m', n)``, float64
-    :param steps: Environment steps behind one estimate
-    :param seconds: Time behind all estimates
-    :param counts: Resamples of the estimates, shape ``(r, m)``
-    :param reference_counts: Resamples of the reference, shape ``(r, m')``
-    :param confidence: Probability that an interval is to cover the truth
+    Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``, shape
+    ``(n_episodes, n)``, float64; and the environment steps of all environments.
     """
-    found, of_reference = moments(gram(gradients), counts), moments(gram(reference), reference_counts)
-    products = (counts @ (gradients @ reference.T) * reference_counts).sum(1) / (
-        counts.sum(1) * reference_counts.sum(1)
-    )
-    to_reference = cosine(found, of_reference, products, confidence)
-    ratio = interval(signal_to_noise(found) / steps, confidence)
-    return EstimatorRow(name, to_reference, ratio, steps, seconds / len(gradients))
+    env = env_of(model)
+    collector = undiscounted(model).sampling_copy(n_episodes, "leave_one_out")
+    with undisturbed(model):
+        env.seed(int(th.randint(2**31, ())))
+        rollout, infos = collect_episodes(collector)
+    weights = rollout.returns - baselines.leave_one_out(rollout)
+    gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
+    wanted = {id(parameter) for parameter in actor_parameters(rollout.policy)}
+    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
+    return gradients[:, mask], len(infos) * env.num_envs
+
+
+def undiscounted(model: REINFORCE | FiniteDifference) -> REINFORCE:
+    """A REINFORCE with a model's policy and environments, which weighs scores by reward-to-go at γ = 1."""
+    if isinstance(model, REINFORCE):
+        copied = copy.copy(model)
+    else:
+        copied = REINFORCE(
+            type(model.policy),
+            env_of(model),
+            policy_kwargs=model.policy_kwargs,
+            max_episode_steps=model.max_episode_steps,
+            device=model.device,
+        )
+        copied.policy = model.policy
+    copied.gamma = 1.0
+    copied.gae_lambda = 1.0
+    copied.reward_to_go = True
+    copied.discount_scores = False
+    return copied

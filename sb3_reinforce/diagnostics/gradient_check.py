@@ -1,28 +1,47 @@
-"""Is the gradient right? The debugging list of the policy gradient, as a function that measures each item."""
+"""Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from sb3_reinforce.common.arguments import check_integer
+import numpy as np
+import torch as th
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+
+from sb3_reinforce.common.arguments import check_function, check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import select
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, score_error, sign_error, some
-from sb3_reinforce.diagnostics.rollout_errors import return_error, surrogate_error, weight_error
-from sb3_reinforce.diagnostics.sampling import check_model, sampled, seeded
+from sb3_reinforce.common.tensors import select, stack, to_vector
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, some
+from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.estimation.scores import scored_parameters
+from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.sampling.measurement import undisturbed
+
+Infos = list[list[dict[str, Any]]]
+
+# By check: the largest error that passes, and what the error compares
+CHECKS = {
+    "log_prob": (1e-4, "log π(a|s) when drawn and when evaluated"),
+    "scores": (0.02, "∇ log π by autograd and by finite differences"),
+    "sign": (0.0, "fraction of sampled actions that a step along their own score makes less likely"),
+    "returns": (1e-4, "G_t and its definition from the rewards"),
+    "weights": (1e-4, "the weights used in training and G_t − b_t"),
+    "surrogate": (1e-3, "the step of train() and Σ w_t ∇ log π"),
+}
 
 
 @dataclass(frozen=True)
 class CheckRow:
     """
-    One line of the debugging list.
+    One item of the checklist.
 
     :param check: What was checked
-    :param error: The figure: how far the two sides are apart
-    :param allowed: The largest figure that passes
-    :param passed: Whether it does
-    :param meaning: What the figure compares
+    :param error: How far the two sides are apart
+    :param allowed: The largest error that passes
+    :param passed: Whether it passes
+    :param meaning: What the error compares
     """
 
     check: str
@@ -33,16 +52,16 @@ class CheckRow:
 
 
 class CheckTable(Table[CheckRow]):
-    """The lines of a gradient check."""
+    """The items of a gradient check."""
 
     @property
     def passed(self) -> bool:
-        """Whether every line passes."""
+        """Whether every item passes."""
         return all(row.passed for row in self)
 
     @property
     def failures(self) -> list[str]:
-        """The names of the lines that fail."""
+        """The names of the items that fail."""
         return [row.check for row in self if not row.passed]
 
 
@@ -50,66 +69,121 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     """
     Check the chain from the environment to the gradient, on whole episodes that the model itself collects.
 
-    ``log_prob``: log π that training differentiates is log π of the actions drawn. ``scores``: its gradient by autograd
-    is that by finite differences. ``sign``: a step along the score of an action makes the policy draw it more often, or
-    draw nearer to it; a policy that always draws the same cannot be checked for it, and does not pass. ``returns`` and
-    ``weights``: G_t and G_t − b_t follow from the rewards by their definitions. ``surrogate``: the step of ``train()``
-    is the sum of the weighted scores. A policy of one's own, or a subclass of REINFORCE, is checked as it is. With gSDE
-    ``scores`` fails as Stable-Baselines3 makes it: the standard deviation's dependence on the features is detached
-    there, unless ``policy.action_dist.learn_features`` is set.
+    - ``log_prob``: the log π that training differentiates is the log π of the sampled actions.
+    - ``scores``: its gradient by autograd equals its gradient by finite differences.
+    - ``sign``: after a step along the score of an action, the policy samples it more often, or samples closer to it. A
+      policy that always samples the same action cannot be checked, and does not pass.
+    - ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
+    - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
+
+    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails: Stable-Baselines3
+    detaches the features on which the standard deviation depends, unless ``policy.action_dist.learn_features`` is set.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
-    :param n_episodes: Episodes, at least 2
-    :param seed: Seed of the draws and of the directions of the finite differences
-    :return: A table with a ``CheckRow`` each; ``.passed`` tells whether all of them hold
+    :param n_episodes: Number of episodes, at least 2
+    :param seed: Seed of the actions and of the directions of the finite differences
+    :return: A table with one ``CheckRow`` per item; ``.passed`` is True if all of them pass
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If there are too few episodes, or log π cannot be differentiated
     """
     check_model(model)
     check_integer("n_episodes", n_episodes, 2)
-    policy, optimizer = model.policy, model.policy.optimizer
+    policy = model.policy
+    optimizer = policy.optimizer
     state = {name: value.clone() for name, value in policy.state_dict().items()}
     with seeded(policy, check_integer("seed", seed, 0)):
         try:
-            rows = check_rows(model, n_episodes)
+            errors = measure_errors(model, n_episodes)
         finally:
             policy.load_state_dict(state)
             policy.optimizer = optimizer
+    rows = [
+        CheckRow(check, errors[check], allowed, bool(errors[check] <= allowed), meaning)
+        for check, (allowed, meaning) in CHECKS.items()
+    ]
     return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows)
 
 
-def check_rows(model: REINFORCE, n_episodes: int) -> list[CheckRow]:
-    """
-    The lines of ``check_gradient``; the model's policy is trained by the last.
-
-    :param model: The model
-    :param n_episodes: Episodes
-    """
-    sampler, infos = sampled(model, n_episodes, model.baseline)
-    policy, rollout = sampler.policy, sampler._rollout
-    assert rollout is not None
+def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
+    """The error of each check; the last one trains the model's policy."""
+    collector = model.sampling_copy(n_episodes, model.baseline)
+    with undisturbed(model):
+        rollout, infos = collect_episodes(collector)
+    policy = rollout.policy
+    scored_parameters(rollout)
     obs = select(rollout.observations, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
-    scored_parameters(rollout)
-    return [
-        row(
-            "log_prob", log_prob_error(policy, some(obs, actions)[0]), 1e-4, "log π(a|s) when drawn and when evaluated"
-        ),
-        row("scores", score_error(policy, *some(obs, actions)), 0.02, "∇ log π by autograd and by differences"),
-        row("sign", sign_error(policy, obs), 0.0, "share of actions that their own score repels"),
-        row("returns", return_error(sampler, rollout, infos), 1e-4, "G_t and its definition, from the rewards"),
-        row("weights", weight_error(sampler, rollout), 1e-4, "the weights of training and G_t − b_t"),
-        row("surrogate", surrogate_error(sampler, rollout), 1e-3, "the step of train() and Σ w_t ∇ log π"),
-    ]
+    return {
+        "log_prob": log_prob_error(policy, some(obs, actions)[0]),
+        "scores": score_error(policy, *some(obs, actions)),
+        "sign": sign_error(policy, obs),
+        "returns": return_error(collector, rollout, infos),
+        "weights": weight_error(collector, rollout),
+        "surrogate": surrogate_error(collector, rollout),
+    }
 
 
-def row(check: str, error: float, allowed: float, meaning: str) -> CheckRow:
+def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: float, lam: float) -> np.ndarray:
     """
-    A line, which passes if the error is not above what is allowed; NaN fails.
+    ``G_t = (1 − λ) Σ_{n=1}^{N−1} λ^{n−1} G_{t:t+n} + λ^{N−1} G_{t:t+N}``, ``G_{t:t+n} = Σ_{k<n} γ^k r_{t+k} + γ^n V``,
+    for rewards and V(s_{t+1}) of one episode, each of shape (T,).
 
-    :param check: What was checked
-    :param error: The figure
-    :param allowed: The largest figure that passes
-    :param meaning: What the figure compares
+    Sutton and Barto (2018), equations 12.1 and 12.3, term by term instead of by a recursion.
     """
-    return CheckRow(check, error, allowed, bool(error <= allowed), meaning)
+    returns = np.zeros(len(rewards))
+    for t in range(len(rewards)):
+        n = np.arange(1, len(rewards) - t + 1)
+        n_step = np.cumsum(gamma ** (n - 1) * rewards[t:]) + gamma**n * next_values[t:]
+        shares = np.where(n < n[-1], (1 - lam) * lam ** (n - 1.0), lam ** (n - 1.0))
+        returns[t] = shares @ n_step
+    return returns
+
+
+def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
+    """The largest difference between a return and its definition, relative to the largest return."""
+    error = 0.0
+    scale = 1e-12
+    for episode in th.unique(rollout.episodes[rollout.used]):
+        steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
+        values = np.zeros(len(steps))
+        if rollout.values is not None:
+            values[:-1] = rollout.values[steps, envs][1:]
+            info = infos[int(steps[-1])][int(envs[-1])]
+            if info.get("TimeLimit.truncated"):
+                terminal = obs_as_tensor(stack([info["terminal_observation"]]), collector.device)
+                with th.no_grad():
+                    values[-1] = float(rollout.policy.predict_values(terminal))
+        rewards = rollout.rewards[steps, envs].numpy()
+        expected = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
+        if not collector.reward_to_go:
+            expected[:] = expected[0]
+        error = max(error, float(np.abs(rollout.returns[steps, envs].numpy() - expected).max()))
+        scale = max(scale, float(np.abs(expected).max()))
+    return error / scale
+
+
+def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
+    """``‖w − (G − b)‖ / ‖w‖`` over the used steps, where w is what training reads from the rollout buffer."""
+    baseline = check_function("baseline", collector.baseline, BASELINES)
+    expected = (rollout.returns - baseline(rollout).cpu()) * rollout.used
+    return relative_difference(training_weights(collector), expected)
+
+
+def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
+    """The step of ``train()``, without entropy bonus and clipping, against ``Σ_t w_t γ^t ∇ log π / denominator``."""
+    gradients = gradients_by_episode(rollout, training_weights(collector) * rollout.discounts)[0]
+    expected = gradients.sum(0) / rollout.denominator
+    parameters = scored_parameters(rollout)
+    before = to_vector(parameters)
+    # As long as θ if the gradient is shorter: a short step would drown in the rounding of θ
+    rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
+    collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
+    collector.lr_schedule = FloatSchedule(rate)
+    # No critic is trained now
+    collector.baseline = "none"
+    collector.normalize_advantage = False
+    collector.ent_coef = 0.0
+    collector.max_grad_norm = None  # type: ignore[assignment]
+    collector.min_std = 0.0
+    collector.train()
+    return relative_difference(to_vector(parameters) - before, rate * expected)

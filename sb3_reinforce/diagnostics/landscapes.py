@@ -1,4 +1,4 @@
-"""The performance landscape: U(θ) on a plane through the parameters of a policy, and the steps that estimators take."""
+"""The performance landscape: U(θ) on a plane through a policy's parameters, and gradients projected on it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,24 +9,26 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer, check_number
-from sb3_reinforce.diagnostics.sampling import check_env, seeded, undisturbed
-from sb3_reinforce.policies import parameters
-from sb3_reinforce.sampling.candidate_actors import make_actor
-from sb3_reinforce.sampling.candidates import Step, evaluate
+from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.diagnostics.sampling import env_of, seeded
+from sb3_reinforce.diagnostics.statistics import check_directions
+from sb3_reinforce.policies.parameters import actor_parameters
+from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
+from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
+from sb3_reinforce.sampling.measurement import undisturbed
 
 
 class CandidateUtility:
     """
-    ``U(θ) = E[Σ_t r_t]`` of parameter vectors, by the mean return of episodes in a model's environments.
+    ``U(θ) = E[Σ_t r_t]`` of parameter vectors: the mean return of episodes in a model's environments.
 
-    The policy samples its actions, so that this is the utility whose gradient REINFORCE estimates at γ = 1. All
-    candidates of a call start from the same seeds; each call has new ones.
+    The policy samples its actions, so this is the utility whose gradient REINFORCE estimates at γ = 1. All candidates
+    of a call start from the same seeds; every call uses new ones.
 
     :param model: A model with an actor-critic policy and environments
-    :param n_episodes: Episodes behind each utility
+    :param n_episodes: Episodes per utility
     :param seed: Seed of the first episode
     :raises TypeError: If the model has no actor-critic policy
     :raises ValueError: If it has no environments
@@ -35,39 +37,40 @@ class CandidateUtility:
     def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
         if not isinstance(getattr(model, "policy", None), ActorCriticPolicy):
             raise TypeError(f"model must have an actor-critic policy, got {model!r} of type {type(model).__name__}")
-        n_envs = check_env(model).num_envs
-        self.model, self.n_episodes = model, check_integer("n_episodes", n_episodes, 1)
-        self.seed, self.n_steps = check_integer("seed", seed, 0), 0
+        self.model = model
+        self.env = env_of(model)
+        self.n_episodes = check_integer("n_episodes", n_episodes, 1)
+        self.seed = check_integer("seed", seed, 0)
+        self.n_steps = 0
         policy = cast(ActorCriticPolicy, model.policy)
         training = policy.training
-        self.parameters = parameters.actor_parameters(policy)
+        self.parameters = actor_parameters(policy)
         policy.set_training_mode(training)
-        self.theta = parameters.read(self.parameters)
-        self.actor = make_actor(policy, self.parameters, n_envs, deterministic=False)
+        self.theta = to_vector(self.parameters).to("cpu", th.float64)
+        self.actor = make_candidate_actor(policy, self.parameters, self.env.num_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:
         """
-        The utilities.
+        Evaluate candidates.
 
         :param thetas: Shape ``(k, n)``, or ``(m, k, n)``
-        :return: Shape ``(k,)`` or ``(m, k)``, float64
+        :return: Their utilities, shape ``(k,)`` or ``(m, k)``, float64
+        :raises ValueError: If a number is not finite, or an episode does not end
         """
         candidates = thetas.reshape(-1, len(self.theta))
         seeds = np.broadcast_to(self.seed + np.arange(self.n_episodes), (len(candidates), self.n_episodes))
         self.seed += self.n_episodes
         limit = getattr(self.model, "max_episode_steps", 100_000)
-        env, normalize = cast(VecEnv, self.model.env), self.model.get_vec_normalize_env()
+        normalize = self.model.get_vec_normalize_env()
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)
-            returns = evaluate(self.actor, env, candidates, seeds, self.n_episodes, limit, self.count, normalize)
+            returns = evaluate_candidates(
+                self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count, normalize
+            )
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
-    def count(self, step: Step) -> None:
-        """
-        Count the steps of all environments, those of idle ones too.
-
-        :param step: A step
-        """
+    def _count(self, step: CandidateStep) -> None:
+        """Count the steps of all environments, including idle ones."""
         self.n_steps += len(step.dones)
 
 
@@ -77,8 +80,9 @@ class Landscape:
     ``U(θ + x d_1 + y d_2)`` on a grid.
 
     :param scales: The values of x and of y, shape ``(s,)``
-    :param utilities: Shape ``(s, s)``: the row is y, the column is x
-    :param steps: By name, the (x, y) of the gradients' projections on the plane, of length 1 in the largest scale
+    :param utilities: Shape ``(s, s)``: rows are y, columns are x
+    :param steps: By name, the projection (x, y) of each gradient on the plane, scaled to the length of the largest
+        scale
     """
 
     scales: np.ndarray
@@ -101,69 +105,45 @@ def landscape(
     :param model: A model with an actor-critic policy; it is not changed
     :param gradients: Gradients of the actor's parameters to draw, by name, each of shape ``(n,)``
     :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,
-        normalised filter by filter (Li et al., 2018, section 4)
-    :param extent: Half the width of the plane, in directions
+        normalized filter by filter (Li et al., 2018, section 4)
+    :param extent: Half the width of the plane, in multiples of the directions
     :param n_points: Points along each side
-    :param n_episodes: Episodes behind each point
+    :param n_episodes: Episodes per point
     :param seed: Seed of the directions and of the episodes
+    :return: The utilities on the plane, and the projections of the gradients
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range or of the wrong shape
     """
     check_number("extent", extent, 0, above=True)
     check_integer("n_points", n_points, 2)
     utility = CandidateUtility(model, n_episodes, seed)
-    n, gradients = len(utility.theta), {} if gradients is None else gradients
+    n = len(utility.theta)
+    gradients = {} if gradients is None else gradients
     if not isinstance(gradients, Mapping):
         raise TypeError(f"gradients must be a dictionary of tensors by name, got {type(gradients).__name__}")
-    for name, gradient in gradients.items():
-        check_direction(f"gradients[{name!r}]", gradient, (n,))
+    known = {name: check_directions(f"gradients[{name!r}]", given, (n,)) for name, given in gradients.items()}
     if directions is None:
         drawn = th.randn(2, n, dtype=th.float64, generator=th.Generator().manual_seed(seed))
         plane = th.stack([filter_normalized(direction, utility.parameters) for direction in drawn])
     else:
-        check_direction("directions", directions, (2, n))
-        plane = directions.double() / directions.double().norm(dim=1, keepdim=True) * utility.theta.norm()
+        directions = check_directions("directions", directions, (2, n))
+        plane = directions / directions.norm(dim=1, keepdim=True) * utility.theta.norm()
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
     with seeded(cast(ActorCriticPolicy, model.policy), seed):
         utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
     steps = {}
-    for name, gradient in gradients.items():
-        projection = th.linalg.lstsq(plane.T, gradient.double()[:, None]).solution[:, 0]
+    for name, gradient in known.items():
+        projection = th.linalg.lstsq(plane.T, gradient[:, None]).solution[:, 0]
         steps[name] = (extent * projection / projection.norm().clamp(min=1e-300)).numpy()
     return Landscape(scales.numpy(), utilities.numpy(), steps)
 
 
-def check_direction(name: str, direction: th.Tensor, shape: Sequence[int]) -> None:
-    """
-    Check a direction in the space of parameters.
-
-    :param name: Its name, for the message
-    :param direction: The direction
-    :param shape: Its shape
-    :raises TypeError: If it is not a tensor
-    :raises ValueError: If it is of another shape, not finite, or zero
-    """
-    if not isinstance(direction, th.Tensor):
-        raise TypeError(f"{name} must be a tensor, got {direction!r} of type {type(direction).__name__}")
-    norms = direction.double().norm(dim=-1)
-    if direction.shape != th.Size(shape) or not bool((norms.isfinite() & (norms > 0)).all()):
-        raise ValueError(
-            f"{name} must be finite, not zero and of shape {tuple(shape)}, got shape {tuple(direction.shape)} and norm "
-            f"{norms.tolist()}"
-        )
-
-
 def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Tensor:
     """
-    ``d_f ← d_f ‖θ_f‖ / ‖d_f‖`` for each filter f: a row of a weight matrix, or a whole bias.
+    ``d_f ← d_f ‖θ_f‖ / ‖d_f‖`` (n,) for each filter f, a row of a weight matrix or a whole bias (Li et al., 2018).
 
-    Without it, the scale of a layer, which a later layer can undo, would decide how steep the landscape looks.
-    Source: Li et al. (2018), "Visualizing the loss landscape of neural nets", section 4.
-
-    :param direction: Shape ``(n,)``
-    :param like: The parameters θ, with n elements in all
-    :return: Shape ``(n,)``
+    Without it, the scale of a layer, which a later layer can undo, would determine how steep the landscape looks.
     """
     parts = th.split(direction, [parameter.numel() for parameter in like])
     filters = [(d.reshape(len(p) if p.dim() > 1 else 1, -1), p) for d, p in zip(parts, like, strict=True)]

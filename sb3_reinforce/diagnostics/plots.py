@@ -1,8 +1,7 @@
 """
-Pictures of what ``diagnostics`` measures. They need matplotlib: ``pip install "sb3-reinforce[plots]"``.
+Figures of what ``diagnostics`` measures; they need matplotlib: ``pip install "sb3-reinforce[plots]"``.
 
-Each function draws on the Axes that it is given, or on new ones, and returns them: ``ax.figure.savefig(...)`` works
-without a display.
+Each function draws on the given Axes, or on new ones, and returns them: ``ax.figure.savefig(...)`` needs no display.
 """
 
 from collections.abc import Mapping
@@ -21,25 +20,23 @@ except ModuleNotFoundError as error:
     ) from error
 
 from sb3_reinforce.common.arguments import check_integer, check_number
-from sb3_reinforce.diagnostics.comparisons import BaselineRow
+from sb3_reinforce.diagnostics.baseline_comparison import BaselineRow
 from sb3_reinforce.diagnostics.landscapes import Landscape
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.returns import Floats
 
-# Colours that readers with any colour vision tell apart (Okabe and Ito, 2008)
+__all__ = ["plot_baselines", "plot_landscape", "plot_learning_curves", "plot_variances"]
+
+# Distinguishable with any colour vision (Okabe and Ito, 2008)
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-# Those that are seen on the blue, green and yellow of a landscape
+# Visible on the blue, green and yellow of a landscape
 ON_LANDSCAPE = ("#FFFFFF", "#D55E00", "#CC79A7", "#000000", "#E69F00")
-# For print in grey
+# For greyscale prints
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def new_axes(ax: Axes | None) -> Axes:
-    """
-    The Axes to draw on.
-
-    :param ax: Axes, or None for new ones
-    """
+    """The Axes to draw on, new ones for None."""
     if ax is not None:
         return ax
     axes: Axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")[1]
@@ -48,16 +45,17 @@ def new_axes(ax: Axes | None) -> Axes:
 
 def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     """
-    The variance of the gradient of one episode for each baseline, with its interval; the floor as a line.
+    Plot the variance of the gradient of one episode for each baseline with its interval, and the floor as a line.
 
-    :param table: What ``compare_baselines`` returned
-    :param ax: Axes to draw on
+    :param table: The result of ``compare_baselines``
+    :param ax: Axes to draw on; None for new ones
+    :return: The Axes
     """
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]
     values = np.array([row.variance.value for row in rows])
     ends = np.array([[row.variance.low for row in rows], [row.variance.high for row in rows]])
-    # On a logarithmic axis a bar has no foot to be compared from
+    # No bars: on a logarithmic axis their lengths mean nothing
     ax.hlines(range(len(rows)), *ends, color=COLOURS[0], linewidth=2)
     ax.plot(values, range(len(rows)), linestyle="", marker=MARKERS[0], color=COLOURS[0])
     ax.set_yticks(range(len(rows)), [row.baseline for row in rows])
@@ -71,13 +69,9 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
 
 
 def interquartile_mean(scores: Floats) -> Floats:
-    """
-    The mean of the middle half of the scores (Agarwal et al., 2021, section 4.3).
-
-    :param scores: Shape ``(n_scores, ...)``
-    :return: Shape ``(...)``
-    """
-    ordered, cut = np.sort(scores, axis=0), len(scores) // 4
+    """The mean of the middle half of scores (n_scores, ...), shape (...) (Agarwal et al., 2021, section 4.3)."""
+    ordered = np.sort(scores, axis=0)
+    cut = len(scores) // 4
     middle: Floats = ordered[cut : len(scores) - cut].mean(axis=0)
     return middle
 
@@ -86,17 +80,13 @@ def interquartile_interval(
     runs: Floats, n_resamples: int, confidence: float, seed: int
 ) -> tuple[Floats, Floats, Floats]:
     """
-    The interquartile mean over runs and tasks, and the percentile interval of a bootstrap that resamples the runs of
-    each task for itself (Agarwal et al., 2021, section 4.1).
+    Interquartile mean of runs (n_runs, n_tasks, n_points) and its percentile interval, each of shape (n_points,).
 
-    :param runs: Shape ``(n_runs, n_tasks, n_points)``
-    :param n_resamples: Bootstrap resamples
-    :param confidence: Probability that the interval is to cover the truth, at each point
-    :param seed: Seed of the resamples
-    :return: The mean and the two ends, each of shape ``(n_points,)``
+    The bootstrap resamples the runs of each task separately (Agarwal et al., 2021, section 4.1).
     """
     n_runs, n_tasks, n_points = runs.shape
-    generator, tasks = np.random.default_rng(seed), np.arange(n_tasks)
+    generator = np.random.default_rng(seed)
+    tasks = np.arange(n_tasks)
     drawn = (runs[generator.integers(n_runs, size=(n_runs, n_tasks)), tasks] for _ in range(n_resamples))
     resampled = np.stack([interquartile_mean(sample.reshape(-1, n_points)) for sample in drawn])
     low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
@@ -112,17 +102,19 @@ def plot_learning_curves(
     seed: int = 0,
 ) -> Axes:
     """
-    The interquartile mean of several runs with its interval, for each of some algorithms.
+    Plot the interquartile mean over several runs with its interval, for each of several algorithms.
 
     :param runs: By name, scores of shape ``(n_runs, n_points)`` or ``(n_runs, n_tasks, n_points)``
     :param timesteps: Environment steps of the points, shape ``(n_points,)``
-    :param ax: Axes to draw on
-    :param n_resamples: Bootstrap resamples
-    :param confidence: Probability that an interval is to cover the truth, at each point
+    :param ax: Axes to draw on; None for new ones
+    :param n_resamples: Number of bootstrap resamples
+    :param confidence: Probability with which an interval should cover the true value, at each point
     :param seed: Seed of the resamples
-    :raises ValueError: If there are fewer than two runs, or the shapes do not go together
+    :return: The Axes
+    :raises ValueError: If there are fewer than two runs, or the shapes do not match
     """
-    ax, x = new_axes(ax), np.asarray(timesteps, dtype=float)
+    ax = new_axes(ax)
+    x = np.asarray(timesteps, dtype=float)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
     for index, (name, given) in enumerate(runs.items()):
@@ -146,22 +138,26 @@ def plot_variances(
     curves: Mapping[str, ArrayLike], n_episodes: ArrayLike, ax: Axes | None = None, confidence: float = 0.95
 ) -> Axes:
     """
-    The variance of the gradient estimate against the episodes that it is made of: the mean over repetitions and its
-    normal interval, for each of some baselines.
+    Plot the variance of the gradient estimate against its number of episodes, for each of several baselines.
+
+    A point is the mean over repetitions, with its normal interval. Points are shifted sideways, so that none is hidden.
 
     :param curves: By name, variances of shape ``(n_repetitions, n_points)``
     :param n_episodes: Episodes of the points, shape ``(n_points,)``
-    :param ax: Axes to draw on
-    :param confidence: Probability that an interval is to cover the truth
+    :param ax: Axes to draw on; None for new ones
+    :param confidence: Probability with which an interval should cover the true value
+    :return: The Axes
     """
-    ax, x = new_axes(ax), np.asarray(n_episodes, dtype=float)
+    ax = new_axes(ax)
+    x = np.asarray(n_episodes, dtype=float)
     width = NormalDist().inv_cdf((1 + check_number("confidence", confidence, 0, 1)) / 2)
     for index, (name, given) in enumerate(curves.items()):
         variances = np.asarray(given, dtype=float)
-        mean, error = variances.mean(axis=0), variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
-        # Side by side: bands or bars at the same place would hide each other
+        error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
         shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
-        colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
+        colour = COLOURS[index % len(COLOURS)]
+        marker = MARKERS[index % len(MARKERS)]
+        mean = variances.mean(axis=0)
         ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
@@ -173,10 +169,11 @@ def plot_variances(
 
 def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     """
-    U(θ) on a plane through θ, as colours, with the direction in which each estimator's gradient points.
+    Plot U(θ) on a plane through θ in colours, and the directions of the gradients as arrows.
 
-    :param scape: What ``landscape`` returned
-    :param ax: Axes to draw on
+    :param scape: The result of ``landscape``
+    :param ax: Axes to draw on; None for new ones
+    :return: The Axes
     """
     ax = new_axes(ax)
     colours = ax.contourf(scape.scales, scape.scales, scape.utilities, levels=20, cmap="viridis")

@@ -8,11 +8,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.optimization import in_a_row
-from sb3_reinforce.diagnostics.baseline_gradients import gradient_blocks
-from sb3_reinforce.diagnostics.comparisons import functions_of
-from sb3_reinforce.diagnostics.moments import gram, moments, noise_scale, signal_to_noise, variance
+from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
+from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import scored_parameters
@@ -24,31 +23,32 @@ from sb3_reinforce.reinforce import REINFORCE
 
 class GradientQualityCallback(BaseCallback):
     """
-    Logs how noisy the gradient is, from the rollouts that training collects anyway.
+    Logs how noisy the gradient is, computed from the rollouts of the training itself.
 
     Every ``every`` rollouts:
 
-    - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient with its own weights;
-    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, in episodes: rollouts of that many are as much signal as noise;
-    - ``gradient/variance/<baseline>``: tr Σ of one episode, for each of ``baselines``, computed from these episodes;
+    - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient, with the weights of
+      training;
+    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, the number of episodes with a signal-to-noise ratio of 1;
+    - ``gradient/variance/<baseline>``: tr Σ of one episode for each of ``baselines``, computed from these episodes;
     - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
 
-    For a FiniteDifference it is the cosine alone: episodes there have no gradients of their own. How good its estimate
-    is, it logs itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
+    A FiniteDifference has only the cosine, as its episodes have no gradients of their own. It logs the quality of its
+    estimate itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
-    A sample g is the gradient of one episode, or of the part of it that a fixed rollout holds. The estimates are those
-    of a single rollout, and noisy where it has few episodes; with fewer than two there is nothing to log. The cost is
-    about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, two more
-    with ``"optimal"``, and as much again for each 256 MiB that their gradients take, divided by ``every``. Nothing is
-    sampled for it, and training is the same with and without it.
+    A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
+    rollout and are noisy if it has few episodes; with fewer than two nothing is logged. A measurement costs about one
+    forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, two more with
+    ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for it, and training is the
+    same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
-    :param max_episodes: Episodes of a rollout that are looked at
+    :param max_episodes: Largest number of episodes of a rollout that are used
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
-    :raises ValueError: If an argument is out of its range, or names a baseline that is unknown or has no critic, or
-        if the model's episodes are not independent because they share the noise of gSDE
+    :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
+        lacks, or if the model's episodes are not independent because they share the noise of gSDE
     """
 
     def __init__(
@@ -62,11 +62,12 @@ class GradientQualityCallback(BaseCallback):
         self.every = check_integer("every", every, 1)
         self.max_episodes = check_integer("max_episodes", max_episodes, 2)
         self.baselines = baselines
-        self.seen_model: Any = None
+        self.last_model: Any = None
 
     def _init_callback(self) -> None:
-        if self.model is not self.seen_model:
-            self.seen_model, self.n_rollouts = self.model, 0
+        if self.model is not self.last_model:
+            self.last_model = self.model
+            self.n_rollouts = 0
             self.thetas: list[th.Tensor] = []
             self.parameters: Parameters = []
         if isinstance(self.model, FiniteDifference):
@@ -83,58 +84,47 @@ class GradientQualityCallback(BaseCallback):
         if isinstance(model, FiniteDifference):
             theta = model.theta
         else:
-            rollout = cast(Rollout, cast(REINFORCE, model)._rollout)
+            rollout = cast(Rollout, cast(REINFORCE, model).rollout)
             self.parameters = self.parameters or scored_parameters(rollout)
-            theta = in_a_row(self.parameters)
-        self.thetas, self.n_rollouts = [*self.thetas[-2:], theta], self.n_rollouts + 1
+            theta = to_vector(self.parameters)
+        self.thetas = [*self.thetas[-2:], theta]
+        self.n_rollouts += 1
         if self.n_rollouts % self.every == 0:
             figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)
             for key, figure in figures.items():
                 self.logger.record(f"gradient/{key}", figure)
 
     def cosine(self) -> dict[str, float]:
-        """The cosine between the last two updates, once there have been two."""
+        """The cosine between the last two updates, if there have been two."""
         if len(self.thetas) < 3:
             return {}
-        before, after = self.thetas[1] - self.thetas[0], self.thetas[2] - self.thetas[1]
+        before = self.thetas[1] - self.thetas[0]
+        after = self.thetas[2] - self.thetas[1]
         return {"cosine": float(th.cosine_similarity(before, after, dim=0))}
 
     def measure(self, rollout: Rollout) -> dict[str, float]:
-        """
-        The figures of one rollout.
-
-        :param rollout: The rollout, before training on it
-        """
+        """The figures of one rollout, before training on it."""
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
         if n_episodes < 2:
             return {}
-        figures = {}
         weights = {"": training_weights(cast(REINFORCE, self.model)) * rollout.discounts}
         rollout = evenly_spread(rollout, self.max_episodes)
         for name, function in self.functions.items():
             baseline = th.as_tensor(check_baseline(function(rollout), rollout))
             weights[name] = rollout.discounts * (rollout.returns - baseline)
-        n_seen = min(n_episodes, self.max_episodes)
-        matrices = th.zeros(len(weights), n_seen, n_seen, dtype=th.float64)
+        m = min(n_episodes, self.max_episodes)
+        grams = th.zeros(len(weights), m, m, dtype=th.float64)
         for block in gradient_blocks(rollout, *weights.values()):
-            matrices += th.stack([gram(gradients) for gradients in block])
-        for name, matrix in zip(weights, matrices, strict=True):
-            found = moments(matrix, th.ones(1, n_seen, dtype=th.float64))
-            if name:
-                figures[f"variance/{name}"] = float(variance(found))
-            else:
-                figures["snr"] = n_episodes * float(signal_to_noise(found))
-                figures["noise_scale"] = float(noise_scale(found))
+            grams += th.stack([gram(gradients) for gradients in block])
+        own, *others = (compute_moments(matrix, th.ones(1, m, dtype=th.float64)) for matrix in grams)
+        figures = {"snr": n_episodes * float(signal_to_noise(own)), "noise_scale": float(noise_scale(own))}
+        for name, moments in zip(self.functions, others, strict=True):
+            figures[f"variance/{name}"] = float(variance(moments))
         return figures
 
 
 def evenly_spread(rollout: Rollout, n_episodes: int) -> Rollout:
-    """
-    A rollout of which only so many episodes are used, spread evenly over the environments.
-
-    :param rollout: The rollout
-    :param n_episodes: Their number
-    """
+    """A rollout of which only ``n_episodes`` episodes are used, spread evenly over the environments."""
     numbers = th.unique(rollout.episodes[rollout.used])
     if len(numbers) <= n_episodes:
         return rollout

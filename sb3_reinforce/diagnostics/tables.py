@@ -1,24 +1,64 @@
-"""Small tables of results: rows of one dataclass, found by name, printed, or handed on to pandas."""
+"""Results as small tables of numbers with bootstrap intervals, found by name, printed, or exported to pandas."""
 
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Generic, TypeVar
 
-from sb3_reinforce.diagnostics.bootstrap import Estimate
+import torch as th
 
 Row = TypeVar("Row")
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """
+    An estimate with its interval.
+
+    :param value: The estimate; NaN if it is not known
+    :param low: Lower end of the interval
+    :param high: Upper end of the interval
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+UNKNOWN = Estimate(float("nan"), float("nan"), float("nan"))
+
+
+def resamples(m: int, n_resamples: int, seed: int) -> th.Tensor:
+    """How often each of m samples occurs in the sample itself (row 0) and in resamples, ``(1 + n_resamples, m)``."""
+    drawn = th.randint(m, (n_resamples, m), generator=th.Generator().manual_seed(seed))
+    # A resample that repeats one sample m times has no pairs, so it gets a second one
+    drawn[:, 1] = th.where((drawn == drawn[:, :1]).all(1), (drawn[:, 0] + 1) % m, drawn[:, 1])
+    counts = th.zeros(n_resamples, m, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
+    return th.cat([th.ones(1, m, dtype=th.float64), counts])
+
+
+def interval(values: th.Tensor, confidence: float) -> Estimate:
+    """Percentile interval of a statistic of sample and resamples (1 + r,) (Efron and Tibshirani, 1993, chapter 13)."""
+    tail = (1 - confidence) / 2
+    # An end is a value that occurred: infinite noise scales cannot be interpolated
+    low = values[1:].quantile(tail, interpolation="lower")
+    high = values[1:].quantile(1 - tail, interpolation="higher")
+    return Estimate(float(values[0]), float(low), float(high))
+
+
 class Table(Generic[Row]):
     """
-    Rows of one dataclass whose first field is a name.
+    Rows of one dataclass whose first field is a name: ``table["optimal"].variance``, ``len(table)``, ``print(table)``.
 
     :param title: What the table shows
     :param rows: The rows, at least one
     """
 
     def __init__(self, title: str, rows: list[Row]):
-        self.title, self.rows = title, rows
+        self.title = title
+        self.rows = rows
         self.columns = [field.name for field in fields(rows[0])]  # type: ignore[arg-type]
 
     @property
@@ -49,6 +89,7 @@ class Table(Generic[Row]):
         """
         The table as a DataFrame; an estimate takes three columns, ``x``, ``x_low`` and ``x_high``.
 
+        :return: A ``pandas.DataFrame`` with the names as its index
         :raises ImportError: If pandas is not installed
         """
         import pandas
@@ -56,28 +97,23 @@ class Table(Generic[Row]):
         return pandas.DataFrame(self.to_records()).set_index(self.columns[0])
 
     def to_records(self) -> list[dict[str, Any]]:
-        """The rows as dictionaries of names, numbers and texts."""
-        records = []
-        for row in self.rows:
-            record: dict[str, Any] = {}
+        """
+        The rows as dictionaries of names, numbers and texts.
+
+        :return: One dictionary per row, with the columns of ``to_pandas``
+        """
+        records: list[dict[str, Any]] = [{} for _ in self.rows]
+        for row, record in zip(self.rows, records, strict=True):
             for column in self.columns:
-                value = getattr(row, column)
+                record[column] = value = getattr(row, column)
                 if isinstance(value, Estimate):
                     record |= {column: value.value, f"{column}_low": value.low, f"{column}_high": value.high}
-                else:
-                    record[column] = value
-            records.append(record)
         return records
 
 
 def as_text(value: Any) -> str:
-    """
-    A cell of the printed table; what is not known is a dash.
-
-    :param value: A text, a number or an estimate
-    """
-    if isinstance(value, Estimate):
-        value = "-" if value.value != value.value else str(value)
-    if isinstance(value, float):
-        value = "-" if value != value else f"{value:.3g}"
-    return str(value)
+    """A cell of the printed table; an unknown number is a dash."""
+    number = value.value if isinstance(value, Estimate) else value
+    if number != number:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

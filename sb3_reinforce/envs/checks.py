@@ -1,11 +1,10 @@
-"""Checks of environments and of what they return. Each error names the environment; ``learn`` adds the step."""
+"""Checks of what environments return. Each error names the environment; ``learn`` adds the step."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 
 class BadData(ValueError):
@@ -13,45 +12,24 @@ class BadData(ValueError):
 
 
 def is_finite(values: np.ndarray) -> np.ndarray:
-    """
-    Which numbers are finite, also in float32, in which they are learned from.
-
-    :param values: Any shape
-    :return: The same shape
-    """
+    """Which numbers are finite in float32, in which they are learned from; any shape."""
     with np.errstate(over="ignore"):
         return np.isfinite(values.astype(np.float32))
 
 
-def told(value: Any) -> str:
-    """
-    A number that is not finite, for a message.
-
-    :param value: It, or an array with it
-    """
-    return f"{value}{' (float32 ends at 3.4e38)' * bool(np.isfinite(value).all())}"
-
-
 def all_finite(values: np.ndarray) -> bool:
-    """
-    Whether all numbers are finite.
-
-    :param values: Any shape
-    """
+    """Whether all numbers of an array are finite in float32."""
     # One product costs less than isfinite and all; where it is large, they decide
     return values.dtype.kind != "f" or float(np.vdot(values, values)) < 1e76 or bool(is_finite(values).all())
 
 
-def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
-    """
-    Check numbers that came from environments.
+def format_number(value: Any) -> str:
+    """A number that is not finite in float32, for a message."""
+    return f"{value} (float32 ends at 3.4e38)" if np.isfinite(value).all() else str(value)
 
-    :param name: What they are, for the message
-    :param values: An array of shape ``(n_steps, n_envs, ...)`` less the dimensions in ``where``, or a dict of them
-    :param where: The step of the rollout, or the step and the environment, that ``values`` belong to; None for the
-        present step
-    :raises ValueError: Naming the first step and environment where a number is not finite
-    """
+
+def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
+    """Check numbers (n_steps, n_envs, ...) less the leading indices in ``where``; the step None is the present one."""
     if isinstance(values, dict):
         for key, part in values.items():
             check_finite(f"{name} {key!r}", part, where)
@@ -62,22 +40,15 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
     first = tuple(int(i) for i in np.argwhere(~is_finite(values))[0])
     step, env = (*where, *first)[:2]
     if step is None:
-        raise BadData(f"{name} of environment {env} is not finite: {told(values[first])}")
+        raise BadData(f"{name} of environment {env} is not finite: {format_number(values[first])}")
     raise ValueError(
-        f"{name} of environment {env} at step {step} of the rollout is not finite: {told(values[first])}. "
+        f"{name} of environment {env} at step {step} of the rollout is not finite: {format_number(values[first])}. "
         "The policy has not been updated with this rollout."
     )
 
 
 def as_reward(reward: Any, env: int) -> float:
-    """
-    Check a reward.
-
-    :param reward: What an environment returned
-    :param env: Which environment
-    :return: The reward
-    :raises BadData: If it is no number
-    """
+    """The reward of an environment as a float, if it is one number."""
     values = np.asarray(reward)
     if values.size != 1 or values.dtype.kind not in "biuf":
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
@@ -85,25 +56,12 @@ def as_reward(reward: Any, env: int) -> float:
 
 
 def has_form(space: spaces.Space[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    """
-    Whether an array may stand for an observation: integers for real numbers, but no fractions for integers.
-
-    :param space: The observation space
-    :param shape: The array's shape
-    :param dtype: Its dtype
-    """
+    """Whether an array may be an observation: integers may stand for real numbers, but not fractions for integers."""
     return shape == space.shape and dtype.kind in ("biuf" if np.dtype(space.dtype).kind == "f" else "biu")
 
 
 def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
-    """
-    Check the form of an observation, which a VecEnv would stretch, cut or round to that of the space without a word.
-
-    :param space: The observation space
-    :param obs: What an environment returned
-    :param env: Which environment
-    :raises BadData: If it is of another shape or kind, or a category that the space does not have
-    """
+    """Check the form of one observation, which a VecEnv would broadcast, cut or round to its space without a word."""
     if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == space.shape and type(space) is spaces.Box:
         return
     if isinstance(space, spaces.Dict):
@@ -126,16 +84,3 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
         )
     if not isinstance(space, spaces.Box) and not space.contains(values.astype(space.dtype)):
         raise BadData(f"The observation of environment {env} must be in {space}, got {obs!r}")
-
-
-def save_obs(env: DummyVecEnv, i: int, obs: Any) -> None:
-    """
-    What ``env._save_obs(i, obs)`` does, with a check.
-
-    :param env: The environments
-    :param i: Which one
-    :param obs: Its observation
-    :raises BadData: As ``check_observation``
-    """
-    check_observation(env.observation_space, obs, i)
-    DummyVecEnv._save_obs(env, i, obs)

@@ -1,8 +1,7 @@
 """
 A ``gymnasium.vector.VectorEnv`` as a ``VecEnv`` of Stable-Baselines3.
 
-Some environments step all their copies in one array operation, far faster than one copy after the other. Any algorithm
-of Stable-Baselines3 can train on them through this adapter.
+Some environments step all their copies in one array operation, far faster than one copy after the other.
 """
 
 from collections.abc import Callable
@@ -10,52 +9,142 @@ from typing import Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.envs.batches import check_batch, copy, info_of, one_of
-from sb3_reinforce.envs.checks import check_observation
-from sb3_reinforce.estimation.returns import Bools
+from sb3_reinforce.envs.checks import BadData, check_observation, has_form
 
-Restart: TypeAlias = Callable[[Any, Bools], Any]
+Restart: TypeAlias = Callable[[Any, NDArray[np.bool_]], Any]
 
 
-def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: Bools) -> Any:
+class GymnasiumVecEnv(VecEnv):
     """
-    Start new episodes by Gymnasium's ``reset_mask``.
+    A vector environment of Gymnasium for any algorithm of Stable-Baselines3.
 
-    :param env: An environment that does not reset itself
-    :param ended: Which copies to reset, shape ``(n_envs,)``
-    :return: The observations and infos of all copies
+    Each copy is reset within the step that ends its episode; its infos then have ``terminal_observation`` and
+    ``TimeLimit.truncated``, as with ``DummyVecEnv``. Observations and rewards are checked for their form at each step.
+    Wrap it in ``VecMonitor`` to record the episodes from which ``rollout/ep_rew_mean`` is computed. ``seed(s)`` gives
+    copy ``i`` the seed ``s + i`` at the next reset, where the vector environment seeds that way. Attributes can only be
+    set for all copies at once, and methods only be called where there are single copies.
+
+    :param env: A vector environment with ``autoreset_mode`` ``SAME_STEP`` or ``DISABLED``, or Gymnasium's vectorized
+        CartPole, which is then reset within the step
+    :raises TypeError: If ``env`` is not a ``gymnasium.vector.VectorEnv``
+    :raises ValueError: If it resets its copies in place of the next step (``NEXT_STEP``)
     """
-    return env.reset(options={"reset_mask": ended})
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]):
+        if not isinstance(env, VectorEnv):
+            raise TypeError(f"env must be a gymnasium.vector.VectorEnv, got {env!r} of type {type(env).__name__}")
+        self.env = env
+        self.restart = find_restart(env)
+        self.actions: Any = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> VecEnvObs:
+        """Reset all copies with the pending seeds and options, which must be the same for all."""
+        if any(options != self._options[0] for options in self._options):
+            raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
+        obs, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        observations: VecEnvObs = copy(obs)
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Set the actions of the next step, shape ``(n_envs, *action_space.shape)``."""
+        self.actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Make the step; malformed observations and rewards are refused."""
+        obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
+        check_batch(self.observation_space, obs, rewards, self.num_envs)
+        dones = terminated | truncated
+        ended = np.flatnonzero(dones).tolist()
+        if self.restart is None and ended and "final_obs" not in env_infos:
+            raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
+        # A copy that has reset itself returns the last step's observation and infos apart from those of the reset
+        last_obs = env_infos.pop("final_obs", obs)
+        last_infos = env_infos.pop("final_info", env_infos)
+        for mask in ("_final_obs", "_final_info"):
+            env_infos.pop(mask, None)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if env_infos or last_infos:
+            infos = [info_of(last_infos if done else env_infos, i) for i, done in enumerate(dones)]
+        for info, is_cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
+            info["TimeLimit.truncated"] = is_cut
+        if ended:
+            # Gymnasium's RecordEpisodeStatistics puts an episode that has ended beside the infos of the next one
+            episodes = {key: values for key, values in env_infos.items() if key in ("episode", "_episode")}
+            for i in ended:
+                infos[i] |= info_of(episodes, i)
+                check_observation(self.observation_space, one_of(last_obs, i), i)
+                infos[i]["terminal_observation"] = copy(one_of(last_obs, i))
+            obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
+            for i in ended:
+                self.reset_infos[i] = info_of(reset_infos, i)
+        return copy(obs), rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        """Close the vector environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of each copy, or of the vector environment where it has no copies."""
+        copies = getattr(self.env.unwrapped, "envs", None)
+        if copies is not None and attr_name != "render_mode":
+            values = [single.get_wrapper_attr(attr_name) for single in copies]
+        elif hasattr(self.env.unwrapped, "get_attr") and attr_name != "render_mode":
+            values = self.env.unwrapped.get_attr(attr_name)
+        else:
+            values = [getattr(self.env, attr_name)] * self.num_envs
+        return [values[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of all copies; ``indices`` must be None or name all of them."""
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"indices must be None to set {attr_name!r} in a vector environment, got {indices}")
+        if hasattr(self.env.unwrapped, "set_attr"):
+            self.env.unwrapped.set_attr(attr_name, [value] * self.num_envs)
+        else:
+            setattr(self.env.unwrapped, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the copies; a NotImplementedError says where there are none that could be called."""
+        copies = getattr(self.env.unwrapped, "envs", None)
+        wanted = list(self._get_indices(indices))
+        if isinstance(self.env.unwrapped, AsyncVectorEnv) and method_name == "reset":
+            return reset_copies(self.env.unwrapped, wanted, **kwargs)
+        if copies is None and wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
+            return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
+        if copies is None:
+            raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
+        calls = [copies[i].get_wrapper_attr(method_name) for i in wanted]
+        return [call(*method_args, **kwargs) for call in calls]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Whether each copy is wrapped in a ``wrapper_class``."""
+        copies = getattr(self.env.unwrapped, "envs", None)
+        return [copies is not None and is_wrapped(copies[i], wrapper_class) for i in self._get_indices(indices)]
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """A picture of each copy; None where there is none."""
+        pictures: Any = self.env.render() or [None] * self.num_envs
+        return list(pictures)
 
 
-def restart_cart_pole(env: Any, ended: Bools) -> Any:
-    """
-    Start new episodes at once, which Gymnasium's vectorised CartPole would only do in place of the next step.
-
-    :param env: The environment
-    :param ended: Which copies to reset, shape ``(n_envs,)``
-    :return: The observations of all copies, and their infos, which are empty
-    """
-    env.state[:, ended] = env.np_random.uniform(env.low, env.high, (4, ended.sum()))
-    env.steps[ended] = 0
-    env.prev_done[ended] = False
-    return env.state.T.astype(np.float32), {}
-
-
-def restart_of(env: VectorEnv[Any, Any, Any]) -> Restart | None:
-    """
-    How copies whose episode has ended start a new one within the same step, as Stable-Baselines3 expects.
-
-    :param env: The environment
-    :return: A function that resets them; None if the environment does it by itself
-    :raises ValueError: If it resets them in place of the next step. An action would then be ignored and its transition
-        would lead from one episode into the next
-    """
+def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
+    """A function that starts new episodes in copies whose episode has ended; None if the environment does it itself."""
     # Environments of one class share their metadata
     mode = getattr(env.unwrapped, "autoreset_mode", env.metadata.get("autoreset_mode"))
     if mode is AutoresetMode.SAME_STEP:
@@ -71,147 +160,73 @@ def restart_of(env: VectorEnv[Any, Any, Any]) -> Restart | None:
     )
 
 
-class GymnasiumVecEnv(VecEnv):
-    """
-    The adapter: autoreset within the step, ``terminal_observation`` and ``TimeLimit.truncated`` in the infos.
+def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: NDArray[np.bool_]) -> Any:
+    """Start new episodes where ``ended`` (n_envs,) by Gymnasium's ``reset_mask``."""
+    # The environment takes the mask out of the options, so that this wrapper would clear the counts of all copies
+    counts = []
+    wrapper = env
+    while isinstance(wrapper, VectorWrapper):
+        if isinstance(wrapper, RecordEpisodeStatistics):
+            for name in ("episode_start_times", "episode_returns", "episode_lengths", "prev_dones"):
+                counts.append((wrapper, name, getattr(wrapper, name)))
+        wrapper = wrapper.env
+    obs_and_infos = env.reset(options={"reset_mask": ended})
+    for recorder, name, before in counts:
+        getattr(recorder, name)[~ended] = before[~ended]
+    return obs_and_infos
 
-    ``VecMonitor`` on top of it records the episodes that ``rollout/ep_rew_mean`` is made from.
 
-    :param env: A vector environment that resets its copies in the same step, or not by itself, or Gymnasium's natively
-        vectorised CartPole
-    :raises TypeError: If ``env`` is not a vector environment
-    :raises ValueError: If it resets its copies one step late
-    """
+def restart_cart_pole(env: Any, ended: NDArray[np.bool_]) -> Any:
+    """Start new episodes where ``ended`` (n_envs,), which CartPole would do in place of the next step."""
+    env.state[:, ended] = env.np_random.uniform(env.low, env.high, (4, ended.sum()))
+    env.steps[ended] = 0
+    env.prev_done[ended] = False
+    return env.state.T.astype(np.float32), {}
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]):
-        if not isinstance(env, VectorEnv):
-            raise TypeError(f"env must be a gymnasium.vector.VectorEnv, got {env!r} of type {type(env).__name__}")
-        self.env, self.restart = env, restart_of(env)
-        self.actions: Any = None
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
-    def reset(self) -> VecEnvObs:
-        """
-        Reset all copies; copy i gets the seed s + i after ``seed(s)``, if the vector environment seeds that way.
+def reset_copies(env: AsyncVectorEnv, wanted: list[int], seed: int | None = None, options: Any = None) -> list[Any]:
+    """The observation and info of each of the ``wanted`` copies, reset in their processes by ``reset_mask``."""
+    mask = np.isin(np.arange(env.num_envs), wanted)
+    seeds = [seed if is_wanted else None for is_wanted in mask]
+    obs, infos = env.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+    return [(one_of(obs, i), info_of(infos, i)) for i in wanted]
 
-        :raises ValueError: If ``set_options`` has given the copies different options
-        """
-        if any(options != self._options[0] for options in self._options):
-            raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
-        obs, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
-        self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
-        self._reset_seeds()
-        self._reset_options()
-        observations: VecEnvObs = copy(obs)
-        return observations
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """
-        Take the actions of the next step.
+def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -> None:
+    """Check the form of the observations (n_envs, ...), or a dict of them, and the rewards (n_envs,) of a step."""
+    rewards = np.asarray(rewards)
+    if rewards.shape != (n_envs,) or rewards.dtype.kind not in "biuf":
+        got = f"shape {rewards.shape} and dtype {rewards.dtype}"
+        raise BadData(f"The rewards must be {n_envs} numbers, one for each environment, got {got}")
+    parts = {key: np.asarray(part) for key, part in obs.items()} if isinstance(obs, dict) else {"": np.asarray(obs)}
+    spaces_of = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    for part in parts.values():
+        if part.shape[:1] != (n_envs,):
+            raise BadData(f"The observations must be those of {n_envs} environments, got shape {part.shape}")
+    is_checked = parts.keys() >= spaces_of.keys() and all(
+        type(each) is spaces.Box and has_form(each, parts[key].shape[1:], parts[key].dtype)
+        for key, each in spaces_of.items()
+    )
+    if not is_checked:
+        for i in range(n_envs):
+            check_observation(space, one_of(obs, i), i)
 
-        :param actions: Shape ``(n_envs, *action_space.shape)``
-        """
-        self.actions = actions
 
-    def step_wait(self) -> VecEnvStepReturn:
-        """Make the step."""
-        obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
-        check_batch(self.observation_space, obs, rewards, self.num_envs)
-        dones = terminated | truncated
-        if self.restart is None and dones.any() and "final_obs" not in env_infos:
-            raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
-        # A copy that has reset itself tells its last step's observation and infos apart from those of the reset
-        last_obs, last_infos = env_infos.pop("final_obs", obs), env_infos.pop("final_info", env_infos)
-        for mask in ("_final_obs", "_final_info"):
-            env_infos.pop(mask, None)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if env_infos or last_infos:
-            infos = [info_of(last_infos if done else env_infos, i) for i, done in enumerate(dones)]
-            # Gymnasium's RecordEpisodeStatistics tells of an episode that has ended beside the infos of the next one
-            episodes = {key: values for key, values in env_infos.items() if key in ("episode", "_episode")}
-            for i in np.flatnonzero(dones).tolist():
-                infos[i] |= info_of(episodes, i)
-        for info, is_cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
-            info["TimeLimit.truncated"] = is_cut
-        if dones.any():
-            ended = np.flatnonzero(dones).tolist()
-            for i in ended:
-                check_observation(self.observation_space, one_of(last_obs, i), i)
-                infos[i]["terminal_observation"] = copy(one_of(last_obs, i))
-            obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
-            for i in ended:
-                self.reset_infos[i] = info_of(reset_infos, i)
-        return copy(obs), rewards.astype(np.float32), dones, infos
+def one_of(obs: Any, i: int) -> Any:
+    """The observation of copy ``i``."""
+    return {key: part[i] for key, part in obs.items()} if isinstance(obs, dict) else obs[i]
 
-    def close(self) -> None:
-        """Close the vector environment."""
-        self.env.close()
 
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """
-        An attribute of each copy, or what all share where the vector environment has no copies of its own.
+def copy(obs: Any) -> Any:
+    """Observations that the environment does not write into later."""
+    return {key: np.array(part) for key, part in obs.items()} if isinstance(obs, dict) else np.array(obs)
 
-        :param attr_name: Its name
-        :param indices: Of which copies
-        """
-        copies = getattr(self.env.unwrapped, "envs", None)
-        if copies is not None and attr_name != "render_mode":
-            values = [single.get_wrapper_attr(attr_name) for single in copies]
-        elif hasattr(self.env.unwrapped, "get_attr") and attr_name != "render_mode":
-            values = self.env.unwrapped.get_attr(attr_name)
-        else:
-            values = [getattr(self.env, attr_name)] * self.num_envs
-        return [values[i] for i in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """
-        Set an attribute of all copies.
-
-        :param attr_name: Its name
-        :param value: Its value
-        :param indices: All copies: vector environments cannot set it for some of them
-        :raises ValueError: If ``indices`` names some copies only
-        """
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"indices must be None to set {attr_name!r} in a vector environment, got {indices}")
-        if hasattr(self.env.unwrapped, "set_attr"):
-            self.env.unwrapped.set_attr(attr_name, [value] * self.num_envs)
-        else:
-            setattr(self.env.unwrapped, attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
-        """
-        Call a method of the copies.
-
-        :param method_name: Its name
-        :param method_args: Its arguments
-        :param indices: Of which copies
-        :param kwargs: Its keyword arguments
-        :raises NotImplementedError: If the vector environment has no copies that could be called, or only all at once
-        """
-        copies, wanted = getattr(self.env.unwrapped, "envs", None), list(self._get_indices(indices))
-        if copies is None and wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
-            return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
-        if copies is None:
-            raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
-        calls = [copies[i].get_wrapper_attr(method_name) for i in wanted]
-        return [call(*method_args, **kwargs) for call in calls]
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
-    ) -> list[bool]:
-        """
-        Whether copies are wrapped in a wrapper.
-
-        :param wrapper_class: The wrapper
-        :param indices: Of which copies
-        """
-        copies = getattr(self.env.unwrapped, "envs", None)
-        return [copies is not None and is_wrapped(copies[i], wrapper_class) for i in self._get_indices(indices)]
-
-    def get_images(self) -> list[np.ndarray | None]:
-        """A picture of each copy."""
-        pictures: Any = self.env.render() or [None] * self.num_envs
-        return list(pictures)
+def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """The info of copy ``i`` from Gymnasium's dict of arrays, in which ``_key`` masks ``key``."""
+    info = {}
+    for key, values in env_infos.items():
+        is_mask = key.startswith("_") and key[1:] in env_infos
+        if not is_mask and (f"_{key}" not in env_infos or env_infos[f"_{key}"][i]):
+            info[key] = info_of(values, i) if isinstance(values, dict) else values[i]
+    return info

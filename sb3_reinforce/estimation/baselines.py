@@ -1,9 +1,9 @@
 """
-Baselines: what is subtracted from the return before it weighs a score. One pure function each.
+Baselines: what is subtracted from the return before it weights a score. One pure function each.
 
 A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. It keeps the gradient unbiased as long as
-b_t does not depend on the action at t or on what the action has led to (Williams, 1992, theorem 1). A user's own
-function is a baseline too. This module looks up to ``rollouts``, whose ``Rollout`` is what a baseline is given.
+b_t does not depend on the action at t or on its consequences (Williams, 1992, theorem 1). A user's own function is a
+baseline too.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,12 @@ Baseline: TypeAlias = Callable[[Rollout], th.Tensor]
 
 
 def none(rollout: Rollout) -> th.Tensor:
-    """``b_t = 0``. Unbiased."""
+    """
+    ``b_t = 0``. Unbiased.
+
+    :param rollout: The rollout
+    :return: Shape ``(n_steps, n_envs)``, float64, as for all baselines
+    """
     return th.zeros_like(rollout.returns)
 
 
@@ -27,8 +32,11 @@ def mean(rollout: Rollout) -> th.Tensor:
     """
     ``b_t = mean of G over all used steps of the rollout``.
 
-    Biased: the mean contains the returns that it is subtracted from. For N episodes of one length and without γ^t the
-    expected gradient lacks ``∇E[mean_t G_t] / N``.
+    Biased: the mean contains the returns that it is subtracted from. For N episodes of one length and without γ^t, the
+    expected gradient is too small by ``∇E[mean_t G_t] / N``.
+
+    :param rollout: The rollout
+    :return: b_t
     """
     return th.full_like(rollout.returns, float(rollout.returns[rollout.used].mean()))
 
@@ -39,6 +47,9 @@ def time_mean(rollout: Rollout) -> th.Tensor:
 
     With N episodes of one length the expected gradient is exactly (N − 1)/N of the true one: each return is in its own
     mean with weight 1/N. A step that a single episode reaches has weight G_t − b_t = 0.
+
+    :param rollout: The rollout
+    :return: b_t
     """
     totals, counts = _by_timestep(rollout)
     return totals / counts.clamp(min=1)
@@ -49,6 +60,9 @@ def leave_one_out(rollout: Rollout) -> th.Tensor:
     ``b_t = mean of G_t over the other episodes that reach step t``, and 0 where there is none.
 
     Unbiased: the other episodes know nothing of this one's action (Kool et al., 2019, "Buy 4 REINFORCE samples").
+
+    :param rollout: The rollout
+    :return: b_t
     """
     totals, counts = _by_timestep(rollout)
     return (totals - rollout.returns) * rollout.used / (counts - 1).clamp(min=1)
@@ -58,8 +72,13 @@ def value(rollout: Rollout) -> th.Tensor:
     """
     ``b_t = V(s_t)``, by the critic as it was before this rollout trained it. Unbiased with ``gae_lambda=1`` where no
     episode is cut.
+
+    :param rollout: The rollout; ``values`` must not be None
+    :return: b_t
+    :raises ValueError: If the rollout has no values
     """
-    assert rollout.values is not None
+    if rollout.values is None:
+        raise ValueError("baseline='value' needs a rollout with values: collect it with a model that has a critic")
     return rollout.values
 
 
@@ -72,34 +91,26 @@ def optimal(rollout: Rollout) -> th.Tensor:
     E‖A‖² − 2b E⟨A, S⟩ + b² E‖S‖² + const, since E[S] = 0; this b minimises it. For the total return it is the mean of
     G_0 weighted by ‖S_j‖² (Peters and Schaal, 2008, section 3.2, summed over components). Unbiased, because the sums
     leave out the episode that b is applied to.
+
+    :param rollout: The rollout
+    :return: b_t
     """
     return ratio_of_others(*score_products(rollout))[rollout.episodes]
 
 
 def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
-    """
-    ``b_i = Σ_{j≠i} products_j / Σ_{j≠i} squares_j``, and 0 where the latter is 0.
-
-    :param products: ⟨A_j, S_j⟩, shape ``(n_episodes,)``
-    :param squares: ‖S_j‖², shape ``(n_episodes,)``
-    :return: Shape ``(n_episodes,)``
-    """
-    above, below = sum_of_others(products), sum_of_others(squares)
+    """``b_i = Σ_{j≠i} products_j / Σ_{j≠i} squares_j``, and 0 where the latter is 0; all of shape ``(n_episodes,)``."""
+    above = sum_of_others(products)
+    below = sum_of_others(squares)
     return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)
 
 
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
-    """
-    ⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``.
-
-    :param rollout: The rollout
-    :return: Two tensors of shape ``(n_episodes,)``, float64; 0 for an episode without used steps
-    """
+    """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     numbers = th.unique(rollout.episodes[rollout.used])
-    for group in numbers.split(
-        max(1, CHUNK // (2 * sum(parameter.numel() for parameter in rollout.policy.parameters())))
-    ):
+    n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
+    for group in numbers.split(max(1, CHUNK // (2 * n_parameters))):
         part = replace(rollout, used=rollout.used & th.isin(rollout.episodes, group))
         weighted, scores = gradients_by_episode(part, rollout.discounts * rollout.returns, rollout.discounts)
         products[group] = th.stack([(weighted * scores).sum(1), scores.square().sum(1)], dim=1).cpu().double()
@@ -107,24 +118,20 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:
-    """
-    ``y_i = Σ_{j≠i} x_j``, as the sum before i plus the sum after i: a difference of sums would lose digits.
-
-    :param x: Shape ``(n,)``
-    :return: Shape ``(n,)``
-    """
+    """``y_i = Σ_{j≠i} x_j``, the sum before i plus the sum after i: a difference of sums would lose digits."""
     zero = x.new_zeros(1)
-    before, after = th.cat([zero, x[:-1]]).cumsum(0), th.cat([x[1:], zero]).flip(0).cumsum(0).flip(0)
+    before = th.cat([zero, x[:-1]]).cumsum(0)
+    after = th.cat([x[1:], zero]).flip(0).cumsum(0).flip(0)
     return before + after
 
 
 def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """The sum of G_t over the used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
     _, group = th.unique(rollout.timesteps, return_inverse=True)
-    totals, counts = (
-        th.zeros(int(group.max()) + 1, dtype=x.dtype).index_add_(0, group.flatten(), x.flatten())
-        for x in (rollout.returns * rollout.used, rollout.used.to(rollout.returns.dtype))
-    )
+    used = rollout.used.to(rollout.returns)
+    zeros = used.new_zeros(int(group.max()) + 1)
+    totals = zeros.index_add(0, group.flatten(), (rollout.returns * used).flatten())
+    counts = zeros.index_add(0, group.flatten(), used.flatten())
     return totals[group], counts[group]
 
 

@@ -74,13 +74,7 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
 
 
 def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
-    """
-    Check that a least-squares problem has something to solve, before an environment is stepped for it.
-
-    :param design: Its design, shape ``(k, n)``
-    :param deltas: The perturbations that it is made of, shape ``(k, n)``
-    :raises ValueError: If the design is zero but for rounding
-    """
+    """Raise an error before an environment is stepped if a design of shape ``(k, n)`` is zero but for rounding."""
     if design.abs().max() <= 1e-12 * deltas.abs().max():
         raise ValueError(
             f"The {len(deltas)} perturbations have no usable direction: forward and central differences need one that "
@@ -89,18 +83,29 @@ def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
 
 
 def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
-    """
-    ``ĝ = argmin ‖design · ĝ − differences‖²``, and of all such ĝ the one of least norm.
-
-    By the singular value decomposition, which is stable where perturbations are nearly collinear; the normal equations
-    would square their condition number.
-
-    :param design: Shape ``(k, n)``
-    :param differences: Shape ``(k,)``
-    :return: ĝ, shape ``(n,)``
-    """
+    """``ĝ = argmin ‖design · ĝ − differences‖²`` of least norm, for a design ``(k, n)`` and differences ``(k,)``."""
+    # By the singular value decomposition: the normal equations would square the condition of the design
     gradient: th.Tensor = th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
     return gradient
+
+
+@dataclass(frozen=True)
+class GradientEstimate:
+    """
+    A gradient of the utility, and the evaluations that it was estimated from.
+
+    :param gradient: ĝ ≈ ∇U(θ), shape ``(n,)``, float64
+    :param candidates: All parameter vectors that were evaluated, shape ``(m, n)``, float64
+    :param utilities: Their mean returns, shape ``(m,)``, float64
+    :param delta_std: The scale of the perturbations
+    :param parameters: The parameters of the policy that θ consists of, with n elements in all
+    """
+
+    gradient: th.Tensor
+    candidates: th.Tensor
+    utilities: th.Tensor
+    delta_std: float
+    parameters: list[th.nn.Parameter]
 
 
 @dataclass(frozen=True)
@@ -119,26 +124,30 @@ class Fit:
     standard_error: th.Tensor | None
 
 
-def fit_quality(deltas: th.Tensor, utilities: th.Tensor, gradient: th.Tensor) -> Fit:
+def fit_quality(candidates: th.Tensor, utilities: th.Tensor, gradient: th.Tensor) -> Fit:
     """
-    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − 1 − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred δ.
+    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − 1 − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred θ + δ.
 
-    :param deltas: Every candidate that was evaluated, less θ, shape ``(m, n)``
-    :param utilities: Their utilities, shape ``(m,)``
+    :param candidates: Every θ + δ that was evaluated, shape ``(m, n)``, float64
+    :param utilities: Their utilities, shape ``(m,)``, float64
     :param gradient: ĝ, shape ``(n,)``
+    :return: The three of them
     """
-    x, y = deltas - deltas.mean(0), utilities - utilities.mean()
+    x = candidates - candidates.mean(0)
+    y = utilities - utilities.mean()
     residuals = y - x @ gradient
-    # Of the smaller of the two products: they have the same rank, and n may be large
-    rank = int(th.linalg.matrix_rank(x @ x.T if len(x) < len(gradient) else x.T @ x, hermitian=True))
+    # Both products have the rank of x; the smaller one is cheaper
+    product = x @ x.T if len(x) < len(gradient) else x.T @ x
+    rank = int(th.linalg.matrix_rank(product, hermitian=True))
     degrees_of_freedom = len(y) - 1 - rank
-    squares, total = float(residuals @ residuals), float(y @ y)
+    squares = float(residuals @ residuals)
+    total = float(y @ y)
     residual_std = (squares / degrees_of_freedom) ** 0.5 if degrees_of_freedom > 0 else float("nan")
-    determined = degrees_of_freedom > 0 and rank == len(gradient)
+    is_determined = degrees_of_freedom > 0 and rank == len(gradient)
     return Fit(
         r_squared=1 - squares / total if total > 0 else float("nan"),
         residual_std=residual_std,
-        standard_error=residual_std * th.linalg.pinv(x).norm(dim=1) if determined else None,
+        standard_error=residual_std * th.linalg.pinv(x).norm(dim=1) if is_determined else None,
     )
 
 

@@ -1,30 +1,35 @@
 """
 Returns of a rollout, as pure functions of arrays of shape ``(n_steps, n_envs)``.
 
-Time runs along the first axis. ``dones[t]`` is True where the step at t is the last of its episode; episodes may begin
-before the rollout and run on after it. ``next_values[t]`` is V of the state that follows the step at t: 0 where the
-episode has terminated, and without a critic 0 everywhere.
+Time is the first axis. ``dones[t]`` is True where step t is the last of its episode; episodes may start before the
+rollout and continue after it. ``next_values[t]`` is V(s_{t+1}): 0 after a terminal state, and 0 everywhere without a
+critic.
 """
+
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.integer]
+Floats: TypeAlias = NDArray[np.floating]
+Bools: TypeAlias = NDArray[np.bool_]
+Integers: TypeAlias = NDArray[np.integer]
 
 
 def discounted_sum(x: Floats, discounts: Floats) -> Floats:
     """
     ``y_t = x_t + discounts_t · y_{t+1}``, with ``y_{n_steps} = 0``.
 
-    In log2(n_steps) passes over the whole array (Hillis and Steele, 1986): each pass doubles the terms that y_t sums.
+    Computed in log2(n_steps) passes over the whole array (Hillis and Steele, 1986, "Data parallel algorithms"): each
+    pass doubles the number of terms in y_t.
 
     :param x: Shape ``(n_steps, n_envs)``
-    :param discounts: Shape ``(n_steps, n_envs)``; a 0 at t keeps what follows out of y_t
+    :param discounts: Shape ``(n_steps, n_envs)``; a 0 at t removes all later terms from y_t
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    y, discounts, reach = x.astype(np.float64), discounts.astype(np.float64), 1
+    y = x.astype(np.float64)
+    discounts = discounts.astype(np.float64)
+    reach = 1
     while reach < len(y):
         y[:-reach] += discounts[:-reach] * y[reach:]
         discounts[:-reach] *= discounts[reach:]
@@ -39,7 +44,8 @@ def lambda_return(
     ``G_t = r_t + γ [(1 − λ) V(s_{t+1}) + λ G_{t+1}]``, and ``G_t = r_t + γ V(s_{t+1})`` at the last step of an episode
     or of the rollout.
 
-    Source: Sutton and Barto (2018), equation 12.2 in recursive form.
+    Source: Sutton and Barto (2018), equation 12.2 in recursive form. G_t − V(s_t) is the generalized advantage estimate
+    (Schulman et al., 2016, equation 16).
 
     :param rewards: Shape ``(n_steps, n_envs)``
     :param dones: Shape ``(n_steps, n_envs)``
@@ -48,16 +54,16 @@ def lambda_return(
     :param gae_lambda: λ: 1 is the Monte Carlo return, 0 the one-step return
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    goes_on = ~dones
-    goes_on[-1] = False
-    return discounted_sum(rewards + gamma * (1 - gae_lambda * goes_on) * next_values, gamma * gae_lambda * goes_on)
+    continues = ~dones
+    continues[-1] = False
+    return discounted_sum(rewards + gamma * (1 - gae_lambda * continues) * next_values, gamma * gae_lambda * continues)
 
 
 def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
     """
     ``G_t = Σ_{k≥t} γ^{k−t} r_k`` over the rest of the episode, or of the rollout.
 
-    It is the λ-return at λ = 1 without a critic. Source: Sutton and Barto (2018), equation 3.8.
+    It is the λ-return with λ = 1 and without a critic. Source: Sutton and Barto (2018), equation 3.8.
 
     :param rewards: Shape ``(n_steps, n_envs)``
     :param dones: Shape ``(n_steps, n_envs)``
@@ -67,30 +73,11 @@ def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
     return lambda_return(rewards, dones, 0.0, gamma, gae_lambda=1.0)
 
 
-def generalized_advantage(
-    rewards: Floats, dones: Bools, values: Floats, next_values: Floats, gamma: float, gae_lambda: float
-) -> Floats:
-    """
-    ``A_t = Σ_k (γλ)^k δ_{t+k}`` with ``δ_t = r_t + γ V(s_{t+1}) − V(s_t)``; at λ = 0 the TD residual δ_t itself.
-
-    It is the λ-return less V(s_t). Source: Schulman et al. (2016), equation 16.
-
-    :param rewards: Shape ``(n_steps, n_envs)``
-    :param dones: Shape ``(n_steps, n_envs)``
-    :param values: V(s_t), shape ``(n_steps, n_envs)``
-    :param next_values: Shape ``(n_steps, n_envs)``
-    :param gamma: Discount factor γ
-    :param gae_lambda: λ, between 0 and 1
-    :return: Shape ``(n_steps, n_envs)``, float64
-    """
-    return lambda_return(rewards, dones, next_values, gamma, gae_lambda) - values
-
-
 def total_return(reward_to_go: Floats, timesteps: Integers, gamma: float, earlier_rewards: Floats) -> Floats:
     """
     ``G_0 = Σ_{k<t} γ^k r_k + γ^t G_t``, the same at every step of an episode.
 
-    Taken at the episode's first step in the rollout, where the sum over k < t is what was earned in earlier rollouts.
+    Evaluated at the episode's first step in the rollout, where the sum over k < t was earned in earlier rollouts.
 
     :param reward_to_go: G_t, shape ``(n_steps, n_envs)``
     :param timesteps: t within the episode, shape ``(n_steps, n_envs)``

@@ -1,8 +1,4 @@
-"""
-What was collected: the view of a rollout that baselines see, and the masks and counts behind it.
-
-Arrays are of shape ``(n_steps, n_envs)``; ``dones[t]`` is True where the step at t is the last of its episode.
-"""
+"""What was collected: the rollout that baselines read, and which of its steps belong to which episode."""
 
 from dataclasses import dataclass
 
@@ -11,13 +7,13 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_reinforce.estimation.returns import Bools, Integers
+from sb3_reinforce.estimation.returns import Bools, Floats, Integers, reward_to_go, total_return
 
 
 @dataclass(frozen=True)
 class Rollout:
     """
-    What a baseline may look at: a rollout with its returns. Every tensor begins with ``(n_steps, n_envs)``.
+    A rollout with its returns, as a baseline sees it. The shape of every tensor starts with ``(n_steps, n_envs)``.
 
     Observations and actions are on the policy's device, all else on the CPU.
 
@@ -31,6 +27,7 @@ class Rollout:
     :param discounts: The factor of the score besides G_t − b_t: γ^t with ``discount_scores``, else 1; float64
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``
     :param policy: The policy that acted, with the parameters with which it acted
+    :param denominator: What the sum over all steps is divided by
     """
 
     observations: PyTorchObs
@@ -43,6 +40,7 @@ class Rollout:
     discounts: th.Tensor
     values: th.Tensor | None
     policy: ActorCriticPolicy
+    denominator: int
 
     @property
     def episodes(self) -> th.Tensor:
@@ -53,71 +51,38 @@ class Rollout:
 
 
 @dataclass(frozen=True)
-class Extent:
+class Running:
     """
-    When a rollout is complete: after a number of steps, or when each environment has finished its quota of episodes.
-
-    :param n_steps: Steps per environment, infinite for whole episodes
-    :param quota: Episodes per environment, shape ``(n_envs,)``; for a number of steps, as many as can end in it
-    :param max_episode_steps: Steps after which an episode that is waited for counts as one that never ends
+    The episodes that run when a rollout starts: t of their next step and ``Σ_{k<t} γ^k r_k``, both ``(n_envs,)``.
     """
 
-    n_steps: float
-    quota: Integers
-    max_episode_steps: float
+    timesteps: Integers
+    rewards: Floats
 
     @classmethod
-    def fixed(cls, n_steps: int, n_envs: int) -> "Extent":
-        """
-        The same number of steps in every environment.
+    def none(cls, n_envs: int) -> "Running":
+        """Every environment is at the start of an episode."""
+        return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
-        :param n_steps: Steps per environment
-        :param n_envs: Number of environments
-        """
-        return cls(n_steps, np.full(n_envs, n_steps), np.inf)
-
-    @classmethod
-    def whole_episodes(cls, n_episodes: int, n_envs: int, max_episode_steps: int) -> "Extent":
-        """
-        A number of episodes per environment, fixed beforehand: "the first to finish" would favour short episodes.
-
-        :param n_episodes: Episodes of all environments together; the quotas differ by at most 1
-        :param n_envs: Number of environments
-        :param max_episode_steps: Steps after which an episode counts as one that never ends
-        """
-        quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
-        return cls(np.inf, quota, max_episode_steps)
+    def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
+        """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
+        timesteps = timesteps_of(dones, self.timesteps)
+        earned = total_return(reward_to_go(rewards, dones, gamma), timesteps, gamma, self.rewards)
+        return Running(np.where(dones[-1], 0, timesteps[-1] + 1), np.where(dones[-1], 0.0, earned[-1]))
 
 
 def within_quota(dones: Bools, quota: Integers) -> Bools:
-    """
-    Which steps belong to the first ``quota`` episodes of their environment.
-
-    :param dones: Shape ``(n_steps, n_envs)``
-    :param quota: Shape ``(n_envs,)``
-    :return: Shape ``(n_steps, n_envs)``
-    """
+    """Which steps, ``(n_steps, n_envs)``, belong to the first ``quota`` episodes of their environment."""
     return dones.cumsum(axis=0) - dones < quota
 
 
 def in_finished_episode(dones: Bools) -> Bools:
-    """
-    Which steps belong to an episode that ends within the rollout.
-
-    :param dones: Shape ``(n_steps, n_envs)``
-    :return: Shape ``(n_steps, n_envs)``
-    """
+    """Which steps, ``(n_steps, n_envs)``, belong to an episode that ends within the rollout."""
     return np.logical_or.accumulate(dones[::-1], axis=0)[::-1]
 
 
 def timesteps_of(dones: Bools, first: Integers) -> Integers:
-    """
-    t within the episode of each step: the row, less the row where the episode began.
-
-    :param dones: Shape ``(n_steps, n_envs)``
-    :param first: Timestep of the first row, where the episode may have begun in an earlier rollout, shape ``(n_envs,)``
-    :return: Shape ``(n_steps, n_envs)``
-    """
+    """t within the episode, ``(n_steps, n_envs)``: the row less the row of the episode's start, ``−first`` at first."""
     rows = np.arange(len(dones))[:, None]
-    begins = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
-    return rows - np.maximum.accumulate(begins, axis=0)
+    starts = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
+    return rows - np.maximum.accumulate(starts, axis=0)

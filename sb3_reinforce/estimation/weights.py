@@ -1,6 +1,7 @@
-"""From what was collected to the weights G_t − b_t of the scores."""
+"""From rewards to the weights γ^t (G_t − b_t) of the scores, as functions of arrays."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,135 +14,92 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
-from sb3_reinforce.estimation import baselines
-from sb3_reinforce.estimation.baselines import Baseline
-from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, reward_to_go, total_return
-from sb3_reinforce.estimation.rollout import Extent, Rollout, in_finished_episode, timesteps_of, within_quota
-from sb3_reinforce.policies.critic import values_after, values_of
-from sb3_reinforce.sampling.collection import Ends, by_step
+from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
+from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
 
-@dataclass(frozen=True)
-class Running:
-    """
-    The episodes that run when a rollout begins.
-
-    :param timesteps: t of their next step, shape ``(n_envs,)``
-    :param rewards: ``Σ_{k<t} γ^k r_k``, what they have earned so far, shape ``(n_envs,)``
-    """
-
-    timesteps: Integers
-    rewards: Floats
-
-    @classmethod
-    def none(cls, n_envs: int) -> "Running":
-        """
-        Every environment is at the start of an episode.
-
-        :param n_envs: Number of environments
-        """
-        return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
-
-    def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
-        """
-        The episodes that run when the rollout has ended.
-
-        :param rewards: Shape ``(n_steps, n_envs)``
-        :param dones: Shape ``(n_steps, n_envs)``
-        :param gamma: Discount factor γ
-        """
-        timesteps = timesteps_of(dones, self.timesteps)
-        earned = total_return(reward_to_go(rewards, dones, gamma), timesteps, gamma, self.rewards)
-        return Running(np.where(dones[-1], 0, timesteps[-1] + 1), np.where(dones[-1], 0.0, earned[-1]))
-
-
-@dataclass(frozen=True)
-class Weighing:
-    """
-    What weighs a score: the arguments of REINFORCE of the same names.
-
-    :param baseline: b_t
-    :param gamma: Discount factor γ
-    :param gae_lambda: λ of the return
-    :param reward_to_go: Whether the return is that from t on, or the total one
-    :param discount_scores: Whether the score of step t takes the factor γ^t
-    """
-
-    baseline: Baseline
-    gamma: float
-    gae_lambda: float
-    reward_to_go: bool
-    discount_scores: bool
-
-    @property
-    def has_critic(self) -> bool:
-        """Whether V is needed: then it also tells what a cut episode is worth."""
-        return self.baseline is baselines.value
-
-
-def weigh(
-    policy: ActorCriticPolicy,
+def complete_rollout(
     buffer: RolloutBuffer,
-    ends: Ends,
-    last_obs: Any,
-    extent: Extent,
+    policy: ActorCriticPolicy,
+    dones: Bools,
+    quota: Integers | None,
     running: Running,
-    weighing: Weighing,
+    next_values: Floats | None,
+    *,
+    baseline: Callable[[Rollout], th.Tensor],
+    gamma: float,
+    gae_lambda: float,
+    reward_to_go: bool,
+    discount_scores: bool,
+    normalize_by: str,
 ) -> Rollout:
     """
-    Compute G_t and G_t − b_t of a collected rollout, and complete the rollout buffer with them.
+    m_t, G_t, γ^t and D of what was collected; ``G_t − b_t`` and what a critic is fitted to are written to the buffer.
 
-    :param policy: The policy that acted
-    :param buffer: The rollout buffer: gets ``values``, ``advantages`` (G_t − b_t) and ``returns`` (what a critic is
-        fitted to, without one G_t); the latter two are 0 at steps that are not used
-    :param ends: How the episodes ended
-    :param last_obs: The observations after the last step
-    :param extent: What was to be collected
-    :param running: The episodes that ran when the rollout began
-    :param weighing: How to weigh
-    :return: The rollout, as baselines see it
-    :raises ValueError: If no step can be used, or the baseline is not as it must be
+    ``quota`` is None for a fixed number of steps, and ``next_values`` None without a critic.
     """
-    rewards, dones, gamma = buffer.rewards, ends.dones, weighing.gamma
+    rewards = buffer.rewards
     timesteps = timesteps_of(dones, running.timesteps)
-    used = within_quota(dones, extent.quota) & (weighing.has_critic | in_finished_episode(dones))
-    check_used(used, extent)
-    next_values: Floats | float = 0.0
-    if weighing.has_critic:
-        buffer.values = values_of(policy, buffer)
-        next_values = values_after(policy, buffer.values, last_obs, ends)
-    returns_to_go = lambda_return(rewards, dones, next_values, gamma, weighing.gae_lambda)
-    returns = returns_to_go
-    if not weighing.reward_to_go:
-        returns = total_return(returns_to_go, timesteps, gamma, running.rewards)
+    # m_t = 1 where G_t is known
+    used = np.ones_like(dones) if next_values is not None else in_finished_episode(dones)
+    if quota is not None:
+        used = used & within_quota(dones, quota)
+    check_used(used, None if quota is not None else len(dones))
+    returns_to_go = lambda_return(rewards, dones, 0.0 if next_values is None else next_values, gamma, gae_lambda)
+    returns = returns_to_go if reward_to_go else total_return(returns_to_go, timesteps, gamma, running.rewards)
+    # The total return has γ^t already
+    exponents = timesteps * (discount_scores and reward_to_go)
+    if quota is None:
+        denominator = used.size
+    else:
+        denominator = int(used.sum() if normalize_by == "steps" else quota.sum())
     rollout = Rollout(
         observations=obs_as_tensor(buffer.observations, policy.device),
         actions=th.as_tensor(buffer.actions, device=policy.device),
         rewards=th.as_tensor(rewards).double(),
         dones=th.as_tensor(dones),
         timesteps=th.as_tensor(timesteps),
-        used=th.as_tensor(used),
+        used=th.as_tensor(used.copy()),
         returns=th.tensor(returns),
-        discounts=th.as_tensor(gamma ** (timesteps * (weighing.discount_scores and weighing.reward_to_go))),
-        values=th.as_tensor(buffer.values).double() if weighing.has_critic else None,
+        discounts=th.as_tensor(gamma**exponents),
+        values=None if next_values is None else th.as_tensor(buffer.values).double(),
         policy=policy,
+        denominator=denominator,
     )
-    baseline = check_baseline(weighing.baseline(rollout), rollout)
-    buffer.advantages = ((returns - baseline) * used).astype(np.float32)
-    buffer.returns = ((returns_to_go if weighing.has_critic else returns) * used).astype(np.float32)
+    buffer.advantages = compute_advantages(rollout, baseline(rollout))
+    buffer.returns = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
     return rollout
 
 
-@dataclass(frozen=True)
-class Steps:
-    """
-    The ``n`` used steps of a rollout in a row, as training needs them.
+def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
+    """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
+    advantages = rollout.returns.numpy() - check_baseline(baseline, rollout)
+    return np.where(rollout.used.numpy(), advantages, 0.0).astype(np.float32)
 
-    :param observations: s_t, a tensor of shape ``(n, ...)`` or a dict of such tensors
-    :param actions: a_t as ``evaluate_actions`` takes them
-    :param weights: What each score is multiplied by: γ^t (G_t − b_t), normalized if asked for; float32
-    :param returns: What the critic is fitted to, float32
-    :param values: V(s_t) before the critic is fitted, float64 on the CPU; None without a critic
+
+def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:
+    """``γ^t (G_t − b_t)`` of the used steps in a row, shape ``(n,)``, float32; γ^t only with ``discount_scores``."""
+    device = rollout.actions.device
+    weights = select(th.as_tensor(advantages, device=device), rollout.used)
+    if normalize:
+        weights = standardize(weights)
+    return weights * select(rollout.discounts, rollout.used).to(weights)
+
+
+def standardize(weights: th.Tensor) -> th.Tensor:
+    """``(w − mean) / std``, or w if there are fewer than two samples or all are equal."""
+    if len(weights) < 2 or weights.max() == weights.min():
+        return weights
+    return (weights - weights.mean()) / (weights.std() + 1e-8)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """
+    The ``n`` used steps of a rollout in a row, as ``train`` takes them.
+
+    ``weights`` are γ^t (G_t − b_t) and ``returns`` what the critic is fitted to, float32; ``values`` are V(s_t) before
+    the critic is fitted, float64 on the CPU, or None without a critic.
     """
 
     observations: PyTorchObs
@@ -151,53 +109,26 @@ class Steps:
     values: th.Tensor | None
 
 
-def used_steps(rollout: Rollout, buffer: RolloutBuffer, normalize: bool) -> Steps:
-    """
-    Take the used steps, with the advantages and returns of the buffer, which a callback may have changed.
-
-    :param rollout: The rollout
-    :param buffer: The rollout buffer
-    :param normalize: Whether to normalize the advantages
-    """
-    used, device = rollout.used, rollout.actions.device
-    advantages, returns = (
-        select(th.as_tensor(by_step(buffer, rows), device=device), used) for rows in (buffer.advantages, buffer.returns)
-    )
-    return Steps(
+def training_batch(rollout: Rollout, advantages: Floats, returns: Floats, normalize: bool) -> Batch:
+    """The used steps of a rollout, with the advantages and returns of the buffer, which a callback may have changed."""
+    used = rollout.used
+    return Batch(
         observations=select(rollout.observations, used),
         actions=as_policy_actions(select(rollout.actions, used), rollout.policy.action_space),
-        weights=(normalized(advantages) if normalize else advantages) * select(rollout.discounts, used).to(advantages),
-        returns=returns,
+        weights=compute_weights(rollout, advantages, normalize),
+        returns=select(th.as_tensor(returns, device=rollout.actions.device), used),
         values=None if rollout.values is None else select(rollout.values, used),
     )
 
 
-def normalized(weights: th.Tensor) -> th.Tensor:
-    """
-    ``(w − mean) / std``, or ``w`` where there are fewer than two samples or they do not differ.
-
-    :param weights: Shape ``(n,)``
-    :return: Shape ``(n,)``
-    """
-    if len(weights) < 2 or weights.max() == weights.min():
-        return weights
-    return (weights - weights.mean()) / (weights.std() + 1e-8)
-
-
-def check_used(used: Bools, extent: Extent) -> None:
-    """
-    Check that a rollout has steps whose return is known, and warn where a fixed rollout leaves steps out.
-
-    :param used: Mask of shape ``(n_steps, n_envs)``
-    :param extent: What was to be collected
-    :raises ValueError: If no step can be used
-    """
+def check_used(used: Bools, n_steps: int | None) -> None:
+    """Refuse a rollout of ``n_steps`` without a known return, and warn if episodes that it cuts are left out."""
     if not used.any():
         raise ValueError(
-            f"No episode ended within n_steps={extent.n_steps}, and without a critic the return of an unfinished "
-            "episode is not known: raise n_steps, set n_episodes instead, or use baseline='value'"
+            f"No episode ended within n_steps={n_steps}, and without a critic the return of an unfinished episode is "
+            "not known: raise n_steps, set n_episodes instead, or use baseline='value'"
         )
-    if np.isfinite(extent.n_steps) and not used.all():
+    if n_steps is not None and not used.all():
         warnings.warn(
             "Episodes that n_steps cuts are left out, since without a critic their return is not known. Long episodes "
             "are cut more often than short ones, so the gradient is biased towards short episodes: n_episodes instead "
@@ -207,15 +138,7 @@ def check_used(used: Bools, extent: Extent) -> None:
 
 
 def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
-    """
-    Check what a baseline has returned.
-
-    :param baseline: b_t, meant to be of shape ``(n_steps, n_envs)``
-    :param rollout: The rollout it belongs to
-    :return: b_t as an array, float64
-    :raises TypeError: If it is not a tensor
-    :raises ValueError: If its shape is wrong, or it is not finite at a step that is used
-    """
+    """b_t as an array, float64; an error unless it is a tensor of shape ``(n_steps, n_envs)``, finite at used steps."""
     if not isinstance(baseline, th.Tensor):
         raise TypeError(f"baseline must return a tensor, got {type(baseline).__name__}")
     if baseline.shape != rollout.returns.shape:
@@ -227,6 +150,7 @@ def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
     wrong = np.argwhere(~np.isfinite(values) & rollout.used.numpy())
     if len(wrong):
         step, env = wrong[0]
-        got = f"{values[step, env]} at step {step} of environment {env}"
-        raise ValueError(f"baseline must return finite values, got {got}")
+        raise ValueError(
+            f"baseline must return finite values, got {values[step, env]} at step {step} of environment {env}"
+        )
     return np.where(rollout.used.numpy(), values, 0.0)

@@ -1,117 +1,138 @@
 """
-What REINFORCE asks of an actor-critic policy of Stable-Baselines3, or of a user's own subclass of it.
+What is asked of an actor-critic policy: log π(a|s), the entropy, V(s), and which parameters these depend on.
 
-A method that the user has overridden is called as it is; where nothing is overridden, only the actor is evaluated.
+A method that a user has overridden is called as it is. Where nothing is overridden, only the actor is evaluated.
 """
 
 import math
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
-from sb3_reinforce.policies.backpropagation import through
-from sb3_reinforce.policies.plain_mlp import DivideLogits, actor_layers, overrides
+from sb3_reinforce.policies.plain_mlp import (
+    DivideLogits,
+    evaluate_layers,
+    hooks_of,
+    overrides,
+    plain_actor,
+    plain_critic,
+    takes_vectors,
+    temperature_hooks,
+)
 
-Parameters: TypeAlias = list[th.nn.Parameter]
+Parameters: TypeAlias = list[nn.Parameter]
+
+# At this temperature the logits of float32 networks leave one action
+MIN_TEMPERATURE = 1e-3
 
 
-def tells_values(policy: ActorCriticPolicy, with_critic: bool) -> bool:
+@dataclass(frozen=True)
+class Route:
     """
-    Whether V(s) is told along with the actions.
+    Which methods of a policy are called, decided once for a rollout and once for an update.
 
-    Either the policy overrides ``forward``, or ``extract_features``, which Stable-Baselines3 calls there, or V is
-    needed and actor and critic share a features extractor that has parameters: a pass for V alone would evaluate it
-    again.
-
-    :param policy: The policy
-    :param with_critic: Whether V is needed
+    ``actor`` and ``critic`` are the layers of plain MLPs, else None. With ``forward``, actions come from ``forward``,
+    and V and log π along with them. With ``evaluate_actions``, log π and V come from that method, else from
+    ``get_distribution`` and ``predict_values``.
     """
-    if overrides(policy, "forward") or overrides(policy, "extract_features"):
-        return True
-    is_shared = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
-    return with_critic and is_shared and not has_parts(policy)
+
+    with_critic: bool
+    actor: list[nn.Module] | None
+    critic: list[nn.Module] | None
+    forward: bool
+    evaluate_actions: bool
 
 
-def has_parts(policy: ActorCriticPolicy) -> bool:
+def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     """
-    Whether the policy has its own way to its actions or to V, which ``forward`` and ``evaluate_actions`` would pass by.
+    The route through a policy.
 
-    :param policy: The policy
+    ``forward`` and ``evaluate_actions`` compute the features that actor and critic share only once, but bypass a user's
+    ``get_distribution`` and ``predict_values``.
     """
-    return overrides(policy, "predict_values") or overrides(policy, "get_distribution")
+    actor = plain_actor(policy)
+    critic = plain_critic(policy) if with_critic else None
+    if actor is not None:
+        return Route(with_critic, actor, critic, forward=False, evaluate_actions=overrides(policy, "evaluate_actions"))
+    has_hooks = (
+        bool(hooks_of(policy)) or bool(hooks_of(policy.mlp_extractor)) or "forward" in vars(policy.mlp_extractor)
+    )
+    own_features = overrides(policy, "extract_features")
+    own_parts = overrides(policy, "predict_values", "get_distribution")
+    shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
+    together = with_critic and shares and not own_parts
+    return Route(
+        with_critic,
+        actor=None,
+        critic=critic,
+        forward=overrides(policy, "forward") or own_features or has_hooks or together,
+        evaluate_actions=overrides(policy, "evaluate_actions") or own_features or has_hooks or together,
+    )
 
 
-def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """
-    log π(a|s) and the entropy of π(·|s), without evaluating the critic.
-
-    :param policy: The policy
-    :param obs: ``n`` observations
-    :param actions: As ``as_policy_actions`` gives them
-    :return: Two tensors of shape ``(n,)``. Where the entropy has no closed form (squashed output) it is estimated by
-        −log π(a|s)
-    """
-    return evaluate(policy, obs, actions, with_values=False)[:2]
-
-
-def evaluate(
-    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, with_values: bool
-) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-    """
-    log π(a|s), the entropy of π(·|s), and V(s) if asked for, with one pass of a features extractor that is shared.
-
-    :param policy: The policy
-    :param obs: ``n`` observations
-    :param actions: As ``as_policy_actions`` gives them
-    :param with_values: Whether to evaluate the critic
-    :return: As ``log_prob_and_entropy``, and V(s), shape ``(n,)``
-    """
-    values: th.Tensor | None = None
-    has_own = overrides(policy, "evaluate_actions") or overrides(policy, "extract_features")
-    if has_own or (with_values and not has_parts(policy)):
-        values, log_prob, entropy = policy.evaluate_actions(obs, actions)
-    else:
-        layers = actor_layers(policy)
-        if layers is None:
-            distribution = policy.get_distribution(obs)
-        else:
-            distribution = distribution_of(policy, through(layers, obs.flatten(1).float()))  # type: ignore[union-attr]
-        log_prob, entropy = distribution.log_prob(actions), distribution.entropy()
-        if with_values:
-            values = policy.predict_values(obs)
-    entropy = -log_prob if entropy is None else entropy
-    return log_prob, entropy, values.flatten() if with_values and values is not None else None
+def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.Module) -> th.Tensor:
+    """The features of ``n`` observations by one of the policy's extractors, shape ``(n, features_dim)``."""
+    if isinstance(obs, th.Tensor) and takes_vectors(policy, extractor):
+        # The result of the line below, for a tenth of its price
+        return obs.flatten(1).float()
+    return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
 
 
 def distribution_of(policy: ActorCriticPolicy, outputs: th.Tensor) -> Distribution:
-    """
-    The distribution of actions of a policy whose actor is a plain MLP.
+    """The distribution of actions for logits or means of shape ``(n, width)``, for a plain actor."""
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        return policy.action_dist.proba_distribution(outputs, policy.log_std)
+    return policy.action_dist.proba_distribution(outputs)
 
-    :param policy: The policy
-    :param outputs: What its last layer returns: logits, or means, shape ``(n, width)``
+
+def evaluate(
+    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, with_values: bool
+) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
     """
-    log_std = [policy.log_std] if isinstance(policy.action_dist, DiagGaussianDistribution) else []
-    return policy.action_dist.proba_distribution(outputs, *log_std)
+    log π(a|s), the entropy of π(·|s), and V(s) or None, each of shape ``(n,)``.
+
+    An entropy without closed form (squashed Gaussian) is estimated by −log π(a|s).
+    """
+    values: th.Tensor | None = None
+    if route.evaluate_actions:
+        values, log_prob, entropy = policy.evaluate_actions(obs, actions)
+    else:
+        if route.actor is None:
+            distribution = policy.get_distribution(obs)
+        else:
+            features = extract_features(policy, obs, policy.pi_features_extractor)
+            distribution = distribution_of(policy, evaluate_layers(route.actor, features))
+        log_prob = distribution.log_prob(actions)
+        entropy = distribution.entropy()
+        if with_values:
+            values = policy.predict_values(obs)
+    if entropy is None:
+        entropy = -log_prob
+    return log_prob, entropy, None if values is None else values.flatten()
+
+
+def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """log π(a|s) and the entropy of π(·|s), each of shape ``(n,)``, without evaluating the critic."""
+    return evaluate(policy, route_of(policy), obs, actions, with_values=False)[:2]
 
 
 def split_parameters(
     policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
 ) -> tuple[Parameters, Parameters, Parameters]:
     """
-    Sort the trainable parameters by what depends on them, read from the graph and not from their names.
+    The trainable parameters that log π depends on, those that only V depends on, and those that both depend on.
 
-    :param policy: The policy
-    :param obs: ``n`` observations
-    :param actions: As ``as_policy_actions`` gives them
-    :return: The parameters that log π depends on, those that only V depends on, and those that both depend on (a shared
-        features extractor); the third list is part of the first
+    They are read from the graph and not from their names. The third list (a shared features extractor) is part of the
+    first.
     """
     parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
-    in_actor = reached(log_prob_and_entropy(policy, obs, actions)[0], parameters)
-    in_critic = reached(policy.predict_values(obs), parameters)
+    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
+    in_critic = depends_on(policy.predict_values(obs), parameters)
     table = list(zip(parameters, in_actor, in_critic, strict=True))
     return (
         [parameter for parameter, actor, _ in table if actor],
@@ -120,35 +141,26 @@ def split_parameters(
     )
 
 
-def reached(output: th.Tensor, parameters: Parameters) -> list[bool]:
-    """
-    Which parameters an output depends on.
-
-    :param output: Any tensor
-    :param parameters: The parameters
-    """
+def depends_on(output: th.Tensor, parameters: Parameters) -> list[bool]:
+    """Which parameters an output depends on."""
     if not output.requires_grad:
         return [False] * len(parameters)
     return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
 
 
-# At this temperature the logits of float32 networks leave one action
-MIN_TEMPERATURE = 1e-3
-
-
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     """
-    From now on the policy acts and is evaluated at a temperature. ``policy.save`` does not keep it, a model's does.
+    Let the policy act and be evaluated at temperature τ, from 1e-3 on: a schedule may fall to 0.
 
-    :param policy: A policy over discrete actions
-    :param temperature: τ; below ``MIN_TEMPERATURE`` this stands for it, so that a schedule may fall to 0
-    :raises ValueError: If τ is not 1 and the policy has no ``action_net``
+    ``policy.save`` does not keep it, ``model.save`` does.
     """
     layer = getattr(policy, "action_net", None)
-    if layer is None and temperature != 1:
-        raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
-    hooks = [hook for hook in layer._forward_hooks.values() if isinstance(hook, DivideLogits)] if layer else []
-    if temperature != 1 and not hooks and layer:
+    if layer is None:
+        if temperature != 1:
+            raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
+        return
+    hooks = temperature_hooks(layer)
+    if temperature != 1 and not hooks:
         hooks = [DivideLogits(th.ones((), device=policy.device))]
         layer.register_forward_hook(hooks[0])
     for hook in hooks:
@@ -157,13 +169,7 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
 
 @th.no_grad()
 def floor_std(policy: ActorCriticPolicy, min_std: float) -> None:
-    """
-    ``log_std ← max(log_std, log min_std)``: the projection of the standard deviations to at least ``min_std``.
-
-    :param policy: A policy with Gaussian actions
-    :param min_std: The floor, in units of the (unsquashed) action; 0 is no floor
-    :raises ValueError: If there is a floor and the policy has no ``log_std``
-    """
+    """``log_std ← max(log_std, log min_std)``: project the standard deviations to at least ``min_std``."""
     if min_std > 0:
         if not hasattr(policy, "log_std"):
             raise ValueError(f"min_std needs a policy with a log_std, and {type(policy).__name__} has none")

@@ -1,4 +1,4 @@
-"""θ, the parameters of a policy's actor, as one vector."""
+"""θ, the parameters of a policy's actor, as one vector of float64, which holds every float32 exactly."""
 
 from collections.abc import Sequence
 
@@ -8,50 +8,39 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions, zeros
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, reached
+from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
-    """
-    The trainable parameters that the most likely action depends on: the critic's and ``log_std`` are not among them.
-
-    :param policy: The policy
-    :return: In the policy's own order
-    :raises ValueError: If there are none
-    """
+    """The trainable parameters that log π depends on, in the policy's order, without ``log_std``."""
     obs = obs_as_tensor(zeros(policy.observation_space), policy.device)
     action_dim = int(np.prod(zeros(policy.action_space).shape))
     actions = as_policy_actions(th.zeros(1, action_dim, device=policy.device), policy.action_space)
     log_std = getattr(policy, "log_std", None)
-    searched = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
+    trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
+    training = policy.training
     policy.set_training_mode(False)
-    in_actor = reached(log_prob_and_entropy(policy, obs, actions)[0], searched)
-    parameters = [parameter for parameter, actor in zip(searched, in_actor, strict=True) if actor]
-    if not parameters:
+    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], trainable)
+    with th.no_grad():
+        # A policy keeps its last distribution, and with the graph in it could not be deep-copied
+        log_prob_and_entropy(policy, obs, actions)
+    policy.set_training_mode(training)
+    searched = [parameter for parameter, is_searched in zip(trainable, in_actor, strict=True) if is_searched]
+    if not searched:
         raise ValueError(
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"
         )
-    return parameters
+    return searched
 
 
 def read(parameters: Sequence[th.Tensor]) -> th.Tensor:
-    """
-    Parameters, or their gradients, as one vector. float64 holds every float32 exactly.
-
-    :param parameters: Tensors with n elements in all
-    :return: θ, shape ``(n,)``, float64, on the CPU
-    """
-    return th.cat([parameter.detach().flatten().to("cpu", th.float64) for parameter in parameters])
+    """θ, a copy of the parameters, shape ``(n,)``, on the CPU."""
+    return to_vector(parameters).to("cpu", th.float64)
 
 
 def split(thetas: th.Tensor, parameters: Sequence[th.Tensor]) -> list[th.Tensor]:
-    """
-    Vectors in the shapes, types and on the devices of the parameters that they are values of.
-
-    :param thetas: Shape ``(k, n)``
-    :param parameters: Tensors with n elements in all
-    :return: For each parameter a tensor of shape ``(k, *parameter.shape)``
-    """
+    """For each parameter its values in θs of shape ``(k, n)``, of shape ``(k, *parameter.shape)``."""
     parts = th.split(thetas, [parameter.numel() for parameter in parameters], dim=1)
     return [
         part.reshape(-1, *parameter.shape).to(parameter.device, parameter.dtype)
@@ -61,11 +50,6 @@ def split(thetas: th.Tensor, parameters: Sequence[th.Tensor]) -> list[th.Tensor]
 
 @th.no_grad()
 def write(parameters: Sequence[th.Tensor], theta: th.Tensor) -> None:
-    """
-    Set parameters to the values in a vector.
-
-    :param parameters: Tensors with n elements in all
-    :param theta: θ, shape ``(n,)``
-    """
+    """Set the parameters to the values in θ."""
     for parameter, part in zip(parameters, split(theta[None], parameters), strict=True):
         parameter.copy_(part[0])

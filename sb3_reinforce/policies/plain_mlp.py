@@ -1,12 +1,19 @@
 """
-Which policies are plain MLPs, so that ``passes`` and ``backpropagation`` compute what they would, and which have code
-of their own.
+Plain MLPs: which actors and critics are known to be one, and their forward pass without the price of modules.
+
+A network is plain only if everything on the way from the observation to its output is an unchanged object of
+Stable-Baselines3 or PyTorch. A hook, a replaced method or a class of the user makes it general, and then the policy
+itself is called. (Hooks that PyTorch registers for all modules at once are not looked for.)
 """
 
-from typing import Any
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
@@ -15,121 +22,218 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+)
+from torch import nn
+from torch.nn import functional as F
 
-from sb3_reinforce.policies.backpropagation import parameters_of
+Floats: TypeAlias = NDArray[np.float32]
 
-# What a policy may have changed on the way from an observation to an action, or to V
-ACTOR_METHODS = ("forward", "extract_features", "get_distribution", "_get_action_dist_from_latent")
-CRITIC_METHODS = ("forward", "extract_features", "predict_values")
-# What the noise of the laid-out actor can be turned into
 DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
+ELEMENTWISE = (
+    *(nn.Tanh, nn.ReLU, nn.Identity, nn.ELU, nn.SELU, nn.CELU, nn.SiLU, nn.GELU, nn.Mish, nn.Sigmoid, nn.LogSigmoid),
+    *(nn.LeakyReLU, nn.ReLU6, nn.Softplus, nn.Softsign, nn.Hardtanh, nn.Hardswish, nn.Hardsigmoid, nn.Tanhshrink),
+)
+NUMPY_LAYERS = (nn.Linear, nn.Tanh, nn.ReLU)
+# What a subclass of ActorCriticPolicy may override and still act as one: these methods only build its networks
+CONSTRUCTION = {"__init__", "_build", "_build_mlp_extractor", "_get_constructor_parameters", "make_features_extractor"}
+# The dicts in which a module keeps its hooks, by the name that PyTorch gives them
+HOOKS = tuple(name for name in vars(nn.Identity()) if name.endswith("_hooks"))
+# Multiplications beyond which NumPy's BLAS starts threads, whatever number the user has set for PyTorch
+ONE_THREAD = 2**18
 
 
 class DivideLogits:
-    """
-    ``π(a|s) ∝ exp(logits(s, a) / τ)``: a forward hook for the layer that makes the logits.
-
-    :param temperature: τ, a tensor without dimensions
-    """
+    """``π(a|s) ∝ exp(logits(s, a) / τ)``: a forward hook of the layer that computes the logits."""
 
     def __init__(self, temperature: th.Tensor):
         self.temperature = temperature
 
-    def __call__(self, module: th.nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
-        """
-        Divide the logits.
-
-        :param module: The layer
-        :param inputs: Its inputs
-        :param logits: Its output
-        """
+    def __call__(self, module: nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
+        """``logits / τ``."""
         return logits / self.temperature
 
 
-def overrides(policy: ActorCriticPolicy, method: str) -> bool:
-    """
-    Whether the policy has its own version of a method, in its class or set on itself. A compiled policy has its own
-    ``forward``.
-
-    :param policy: The policy
-    :param method: Name of a method of ``ActorCriticPolicy``
-    """
-    return method in vars(policy) or getattr(type(policy), method, None) is not getattr(ActorCriticPolicy, method)
+def hooks_of(module: nn.Module) -> list[Any]:
+    """All hooks that are registered on a module."""
+    attributes = vars(module)
+    return [hook for name in HOOKS if attributes[name] for hook in attributes[name].values()]
 
 
-def actor_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
-    """
-    The layers from the observation to the parameters of the action distribution.
+def temperature_hooks(module: nn.Module) -> list[DivideLogits]:
+    """The temperature of a layer, in a list of at most one."""
+    return [hook for hook in hooks_of(module) if isinstance(hook, DivideLogits)]
 
-    :param policy: The policy
-    :return: None if the actor is not a plain MLP
+
+@lru_cache
+def methods_of(cls: Any) -> frozenset[str]:
+    """The names of all methods of a class."""
+    return frozenset(name for name in dir(cls) if callable(getattr(cls, name, None)))
+
+
+@lru_cache
+def own_methods(cls: type, base: type) -> frozenset[str]:
+    """The methods of ``base`` that a class overrides; all of them if it is no subclass, as a compiled policy."""
+    if base not in cls.__mro__:
+        return methods_of(base)
+    subclasses = cls.__mro__[: cls.__mro__.index(base)]
+    return methods_of(base) & {name for subclass in subclasses for name in vars(subclass)}
+
+
+def overrides(policy: ActorCriticPolicy, *methods: str) -> bool:
+    """Whether the class of a policy, or the instance, has its own version of one of these methods."""
+    return not own_methods(type(policy), ActorCriticPolicy).union(vars(policy)).isdisjoint(methods)
+
+
+def is_unchanged(thing: Any) -> bool:
+    """Whether neither a method is replaced on an instance nor a hook registered, except for the temperature."""
+    attributes = vars(thing)
+    cls: Any = type(thing)
+    if not methods_of(cls).isdisjoint(attributes):
+        return False
+    if not isinstance(thing, nn.Module) or not any(map(attributes.get, HOOKS)):
+        return True
+    return all(isinstance(hook, DivideLogits) for hook in hooks_of(thing))
+
+
+def plain_actor(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     """
-    if type(policy.action_dist) not in DISTRIBUTIONS or any(overrides(policy, method) for method in ACTOR_METHODS):
+    The layers from the features to the logits or means of a policy whose actor is known to be plain, else None.
+
+    They are ``Linear`` layers with a bias and elementwise activations, and the features are the observations in a row.
+    """
+    if type(policy.action_dist) not in DISTRIBUTIONS or not is_unchanged(policy.action_dist):
         return None
     return plain_layers(policy, policy.pi_features_extractor, "policy_net", policy.action_net)
 
 
-def critic_layers(policy: ActorCriticPolicy) -> list[th.nn.Module] | None:
-    """
-    The layers from the observation to V.
-
-    :param policy: The policy
-    :return: None if the critic is not a plain MLP
-    """
-    if any(overrides(policy, method) for method in CRITIC_METHODS):
-        return None
+def plain_critic(policy: ActorCriticPolicy) -> list[nn.Module] | None:
+    """The layers from the features to V of a policy whose critic is known to be plain, else None."""
     return plain_layers(policy, policy.vf_features_extractor, "value_net", policy.value_net)
 
 
 def plain_layers(
-    policy: ActorCriticPolicy, extractor: BaseFeaturesExtractor, net: str, head: th.nn.Module
-) -> list[th.nn.Module] | None:
-    """
-    The layers, if all that a policy does is to apply linear layers, tanh and ReLU to flat observations.
-
-    :param policy: The policy
-    :param extractor: Its features extractor
-    :param net: Name of the network that follows in the ``MlpExtractor``
-    :param head: The last layer
-    :return: None if there is anything else on the way, a hook or another ``forward``, or a parameter in two layers
-    """
-    space, mlp = policy.observation_space, policy.mlp_extractor
-    if type(mlp) is not MlpExtractor or not isinstance(space, spaces.Box) or is_image_space(space):
+    policy: ActorCriticPolicy, extractor: BaseFeaturesExtractor, net: str, head: nn.Module
+) -> list[nn.Module] | None:
+    """The layers after the features extractor, or None if anything on the way is not known to be plain."""
+    mlp = policy.mlp_extractor
+    if own_methods(type(policy), ActorCriticPolicy) - CONSTRUCTION or type(mlp) is not MlpExtractor:
         return None
     body = getattr(mlp, net)
-    if type(extractor) is not FlattenExtractor or type(body) is not th.nn.Sequential:
+    if type(body) is not nn.Sequential or not is_plain_extractor(extractor):
         return None
     layers = [*body, head]
-    is_plain = all(is_plain_layer(layer) for layer in layers) and not any(map(is_changed, (extractor, body, *layers)))
-    return layers if is_plain and not share_parameters(layers) else None
+    is_plain = all(map(is_plain_layer, layers)) and all(map(is_unchanged, (policy, mlp, body, *layers)))
+    return layers if is_plain else None
 
 
-def is_plain_layer(layer: th.nn.Module) -> bool:
+def is_plain_extractor(extractor: nn.Module) -> bool:
+    """Whether a features extractor only puts numbers in a row."""
+    parts: Iterable[nn.Module] = ()
+    if type(extractor) is FlattenExtractor:
+        parts = (extractor.flatten,)
+    elif type(extractor) is CombinedExtractor:
+        parts = extractor.extractors.values()
+    else:
+        return False
+    return is_unchanged(extractor) and all(type(part) is nn.Flatten and is_unchanged(part) for part in parts)
+
+
+def is_plain_layer(layer: nn.Module) -> bool:
+    """Whether a layer is linear with a bias, or an elementwise activation."""
+    return type(layer) in ELEMENTWISE or (type(layer) is nn.Linear and layer.bias is not None)
+
+
+def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
+    """Whether the features of a policy are known to be its observations, flattened."""
+    space = policy.observation_space
+    is_flat = isinstance(space, spaces.Box) and not is_image_space(space) and type(extractor) is FlattenExtractor
+    return is_flat and is_plain_extractor(extractor)
+
+
+def evaluate_layers(layers: list[nn.Module], x: th.Tensor) -> th.Tensor:
+    """The output of plain layers for inputs of shape ``(n, n_in)``; functions take half the time of small modules."""
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            x = F.linear(x, layer.weight, layer.bias)
+        elif isinstance(layer, nn.Tanh):
+            x = th.tanh(x)
+        else:
+            x = layer(x)
+    return divide(layers[-1], x)
+
+
+def divide(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
+    """The outputs over τ, if the last layer has a temperature."""
+    for hook in temperature_hooks(head):
+        outputs = outputs / hook.temperature
+    return outputs
+
+
+def has_numpy_form(layers: list[nn.Module]) -> bool:
+    """Whether ``numpy_forward`` can compute these layers: tanh and ReLU after linear ones, in float32 on a CPU."""
+    if not isinstance(layers[0], nn.Linear) or not all(isinstance(layer, NUMPY_LAYERS) for layer in layers):
+        return False
+    parameters = [parameter for layer in layers for parameter in layer.parameters()]
+    return all(parameter.dtype is th.float32 and parameter.device.type == "cpu" for parameter in parameters)
+
+
+def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Floats]:
     """
-    Whether a layer is one that ``passes`` and ``backpropagation`` know.
+    Plain layers as one function from ``n`` observations to outputs of shape ``(n, n_out)``.
 
-    :param layer: Any layer
+    For a handful of observations modules take far longer than the arithmetic. Weights are views of the parameters, so
+    that changes in place count at once. The next call may overwrite the result.
     """
-    return type(layer) in (th.nn.Tanh, th.nn.ReLU) or (type(layer) is th.nn.Linear and layer.bias is not None)
+    operations: list[Callable[[Floats], Floats]] = []
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            operations.append(linear_operation(layer, n))
+        elif isinstance(layer, nn.Tanh):
+            operations.append(tanh_in_place)
+        else:
+            operations.append(relu_in_place)
+    hooks = temperature_hooks(layers[-1])
+
+    def outputs(obs: np.ndarray) -> Floats:
+        x: Floats = obs.reshape(n, -1).astype(np.float32, copy=False)
+        for operation in operations:
+            x = operation(x)
+        return x / np.float32(hooks[0].temperature) if hooks else x
+
+    return outputs
 
 
-def share_parameters(layers: list[th.nn.Module]) -> bool:
-    """
-    Whether two layers have a parameter in common.
-
-    :param layers: The layers of a plain MLP
-    """
-    parameters = parameters_of(layers)
-    return len(set(parameters)) < len(parameters)
+def tanh_in_place(x: Floats) -> Floats:
+    """``x ← tanh x``."""
+    np.tanh(x, out=x)
+    return x
 
 
-def is_changed(module: th.nn.Module) -> bool:
-    """
-    Whether a module does something else than its class and its temperature say.
+def relu_in_place(x: Floats) -> Floats:
+    """``x ← max(x, 0)``."""
+    np.maximum(x, 0, out=x)
+    return x
 
-    :param module: Any module
-    """
-    own_hooks = [hook for hook in module._forward_hooks.values() if not isinstance(hook, DivideLogits)]
-    other_hooks = (module._forward_pre_hooks, module._backward_pre_hooks, module._backward_hooks)
-    return any((own_hooks, *other_hooks, "forward" in vars(module)))
+
+def linear_operation(layer: nn.Linear, n: int) -> Callable[[Floats], Floats]:
+    """``x Wᵀ + b`` as a function of x of shape ``(n, n_in)``, written to memory that is used again at each call."""
+    weight = layer.weight.detach()
+    transposed = weight.numpy().T
+    bias = layer.bias.detach().numpy()
+    y = np.empty((n, layer.out_features), dtype=np.float32)
+
+    def by_numpy(x: Floats) -> Floats:
+        np.dot(x, transposed, y)
+        np.add(y, bias, out=y)
+        return y
+
+    def by_torch(x: Floats) -> Floats:
+        th.addmm(layer.bias.detach(), th.from_numpy(x), weight.T, out=th.from_numpy(y))
+        return y
+
+    return by_torch if n * weight.numel() > ONE_THREAD else by_numpy

@@ -1,14 +1,11 @@
 """
-How a policy acts while a rollout is collected.
+How a policy acts while a rollout is collected: as a few NumPy operations if it is a plain MLP, else by its own methods.
 
-``GeneralActor`` asks the policy itself, whatever it is. ``LaidOutActor`` is the same actor for the usual case, a
-plain MLP on flat observations, as a few NumPy operations. Both draw from the same distribution, but not the same
-actions for the same seed: the laid-out one draws its noise for many steps at once, in the form that the distribution
-needs.
+Both take the same actions for the same seed, up to rounding: the first draws its noise as PyTorch's distributions do.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias, cast
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import torch as th
@@ -20,149 +17,169 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
+from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten
-from sb3_reinforce.policies.evaluation import distribution_of, log_prob_and_entropy, tells_values
-from sb3_reinforce.policies.passes import Floats, lay_out
-from sb3_reinforce.policies.plain_mlp import actor_layers
+from sb3_reinforce.policies.evaluation import Route, distribution_of, evaluate
+from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, takes_vectors
 
-# Actions (n_envs, *shape), and V(s) and log π(a|s) (n_envs,) where the policy has told them
+# Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
-# Actions for which noise is drawn at once
-NOISE_ROWS = 1024
+
+class Actor(Protocol):
+    """What draws the actions of a rollout."""
+
+    def act(self, obs: Any) -> Acted:
+        """Draw actions for observations of ``n_envs`` environments."""
+
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
+        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
+
+    def is_current(self, policy: ActorCriticPolicy) -> bool:
+        """Whether the policy would still act as this actor does."""
 
 
-class GeneralActor:
-    """
-    Acts through the policy: through its ``forward`` where that is to tell V too, else through the actor alone.
+class PolicyActor:
+    """Acts by the policy's own methods."""
 
-    :param policy: Any policy
-    :param with_values: Whether to tell V(s) and log π(a|s) along with the actions
-    """
-
-    def __init__(self, policy: ActorCriticPolicy, with_values: bool):
-        self.policy, self.with_values = policy, with_values
-        self.device, self.shape = policy.device, policy.action_space.shape or ()
+    def __init__(self, policy: ActorCriticPolicy, route: Route):
+        self.policy = policy
+        self.route = route
+        self.shape = policy.action_space.shape or ()
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
-        """
-        Draw actions.
-
-        :param obs: Observations of ``n_envs`` environments, an array or a dict of arrays
-        """
-        obs = obs_as_tensor(obs, self.device)
-        if not self.with_values:
-            return self.policy.get_distribution(obs).get_actions().cpu().numpy().reshape(-1, *self.shape), None, None
+        obs = obs_as_tensor(obs, self.policy.device)
+        if not self.route.forward:
+            actions = self.policy.get_distribution(obs).get_actions()
+            return actions.cpu().numpy().reshape(-1, *self.shape), None, None
         actions, values, log_prob = self.policy(obs)
         return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
 
     @th.no_grad()
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
-        """
-        log π(a|s) of all that was done, in one batch: the parameters do not change during a rollout.
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
+        if self.route.forward:
+            return None
+        policy = self.policy
+        rows = as_policy_actions(th.as_tensor(actions, device=policy.device).flatten(0, 1), policy.action_space)
+        obs = flatten(obs_as_tensor(obs, policy.device))
+        return evaluate(policy, self.route, obs, rows, with_values=False)[0].cpu().numpy()
 
-        :param obs: All observations, shape ``(n_steps, n_envs, ...)`` or a dict of such arrays
-        :param actions: All actions, shape ``(n_steps, n_envs, action_dim)``
-        :return: Shape ``(n_steps * n_envs,)``
-        """
-        steps = as_policy_actions(th.as_tensor(actions, device=self.device).flatten(0, 1), self.policy.action_space)
-        return log_prob_and_entropy(self.policy, flatten(obs_as_tensor(obs, self.device)), steps)[0].cpu().numpy()
+    def is_current(self, policy: ActorCriticPolicy) -> bool:
+        return policy is self.policy
 
 
-class LaidOutActor:
-    """
-    Acts by NumPy: the layers one after the other, and noise drawn beforehand.
+class NumpyActor:
+    """Acts by NumPy, for a plain MLP on flat observations."""
 
-    :param policy: A policy whose actor is a plain MLP
-    :param layers: Its layers, as ``actor_layers`` gives them, with the parameters that they have now
-    :param n_envs: Number of observations at a time
-    """
-
-    def __init__(self, policy: ActorCriticPolicy, layers: list[th.nn.Module], n_envs: int):
-        self.policy, self.shape = policy, (n_envs, *(policy.action_space.shape or ()))
-        self.forward = lay_out(layers, n_envs)
-        self.sample, self.noise = make_sampler(policy), make_noise(policy, n_envs)
+    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int, keep_outputs: bool):
+        self.policy = policy
+        self.keep_outputs = keep_outputs
+        self.shape = (n_envs, *(policy.action_space.shape or ()))
+        self.forward = numpy_forward(layers, n_envs)
+        self.sample = sampler_of(policy, n_envs)
         self.outputs: list[Floats] = []
+        self.layers = layers
+        self.addresses = addresses_of(policy, layers)
+        extractor = policy.pi_features_extractor
+        parts = [
+            policy,
+            policy.mlp_extractor,
+            policy.mlp_extractor.policy_net,
+            extractor,
+            *extractor.children(),
+            *layers,
+        ]
+        hooks = [vars(part)[name] for part in parts for name in HOOKS]
+        self.dicts = [vars(policy.action_dist), *map(vars, parts), *hooks]
+        self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
-        """
-        Draw actions, and keep the logits or means that they are drawn from.
-
-        :param obs: Observations of ``n_envs`` environments
-        """
         outputs = self.forward(obs)
-        self.outputs.append(outputs)
-        return self.sample(outputs, next(self.noise)).reshape(self.shape), None, None
+        if self.keep_outputs:
+            self.outputs.append(outputs.copy())
+        return self.sample(outputs).reshape(self.shape), None, None
 
     @th.no_grad()
     def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
-        """
-        log π(a|s) of all that was done, from the logits or means that were kept.
+        outputs = th.as_tensor(np.concatenate(self.outputs))
+        rows = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
+        return distribution_of(self.policy, outputs).log_prob(rows).cpu().numpy()
 
-        :param obs: Not needed
-        :param actions: All actions, shape ``(n_steps, n_envs, action_dim)``
-        :return: Shape ``(n_steps * n_envs,)``
-        """
-        outputs = th.as_tensor(np.concatenate(self.outputs), device=self.policy.device)
-        steps = as_policy_actions(th.as_tensor(actions).flatten(0, 1).to(outputs.device), self.policy.action_space)
-        return distribution_of(self.policy, outputs).log_prob(steps).cpu().numpy()
+    def is_current(self, policy: ActorCriticPolicy) -> bool:
+        # A hook or a replaced method adds an entry to a dict, and other parameters lie elsewhere
+        return (
+            policy is self.policy
+            and sum(map(len, self.dicts)) == self.n_entries
+            and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers
+            and addresses_of(policy, self.layers) == self.addresses
+        )
 
 
-def make_actor(policy: ActorCriticPolicy, n_envs: int, with_critic: bool) -> GeneralActor | LaidOutActor:
+def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int]:
+    """Where the parameters of an actor lie in memory."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    tensors = [tensor for layer in linear for tensor in (layer.weight, layer.bias)]
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        tensors.append(policy.log_std)
+    return [tensor.data_ptr() for tensor in tensors]
+
+
+def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, keep_outputs: bool = True) -> Actor:
+    """The fastest actor that acts as the policy would; ``keep_outputs`` is for ``log_prob``."""
+    if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
+        return NumpyActor(policy, route.actor, n_envs, keep_outputs)
+    return PolicyActor(policy, route)
+
+
+def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Floats], np.ndarray]:
     """
-    The fastest way to act with a policy, as long as its parameters stay as they are.
+    Draws actions from logits or means of shape ``(n_envs, width)``.
 
-    :param policy: The policy
-    :param n_envs: Number of observations at a time
-    :param with_critic: Whether V(s) will be needed
-    """
-    layers = actor_layers(policy)
-    if layers is None:
-        return GeneralActor(policy, tells_values(policy, with_critic))
-    return LaidOutActor(policy, layers, n_envs)
-
-
-def make_noise(policy: ActorCriticPolicy, n_envs: int) -> Iterator[Floats]:
-    """
-    The noise of each step, from PyTorch's generator.
-
-    Gumbel noise ``−log E`` with E exponential for categorical actions, logistic ``log(u / (1 − u))`` for binary ones,
-    ``σ · normal`` for Gaussian ones.
-
-    :param policy: The policy
-    :param n_envs: Number of environments
-    :return: Arrays of shape ``(n_envs, width)``, without end; ``width`` is the number of logits or means
-    """
-    size = (max(1, NOISE_ROWS // n_envs), n_envs, cast(th.nn.Linear, policy.action_net).out_features)
-    while True:
-        if isinstance(policy.action_dist, DiagGaussianDistribution):
-            yield from (th.randn(size) * policy.log_std.detach().exp().cpu()).numpy()
-        elif isinstance(policy.action_dist, BernoulliDistribution):
-            yield from th.rand(size).logit_().numpy()
-        else:
-            yield from th.empty(size).exponential_().log_().neg_().numpy()
-
-
-def make_sampler(policy: ActorCriticPolicy) -> Callable[[Floats, Floats], np.ndarray]:
-    """
-    How parameters of the action distribution and noise, both ``(n_envs, width)``, become actions.
-
-    ``argmax(logits + Gumbel)`` is categorical (Gumbel, 1954), ``logits + logistic > 0`` is Bernoulli with the logits'
-    probability, and ``mean + σ · normal`` is Gaussian.
-
-    :param policy: The policy
+    It takes the same numbers from PyTorch's generator, in the same form and order, as the distributions do.
     """
     distribution = policy.action_dist
     if isinstance(distribution, DiagGaussianDistribution):
-        return np.add
+        return gaussian_sampler(policy.log_std, n_envs, distribution.action_dim)
     if isinstance(distribution, BernoulliDistribution):
-        return lambda logits, logistic: (logits + logistic > 0).astype(np.float32)
+        return lambda logits: th.bernoulli(th.from_numpy(logits).sigmoid()).numpy()
     if isinstance(distribution, CategoricalDistribution):
-        return lambda logits, gumbel: (logits + gumbel).argmax(axis=1)
-    cuts = np.cumsum(cast(MultiCategoricalDistribution, distribution).action_dims)[:-1]
-    return lambda logits, gumbel: np.stack(
-        [part.argmax(axis=1) for part in np.split(logits + gumbel, cuts, axis=1)], axis=1
-    )
+        return categorical_sampler(n_envs, distribution.action_dim)
+    assert isinstance(distribution, MultiCategoricalDistribution)
+    samplers = [categorical_sampler(n_envs, dim) for dim in distribution.action_dims]
+    cuts = np.cumsum(distribution.action_dims)[:-1]
+
+    def sample(logits: Floats) -> np.ndarray:
+        parts = np.split(logits, cuts, axis=1)
+        return np.stack([draw(part) for draw, part in zip(samplers, parts, strict=True)], axis=1)
+
+    return sample
+
+
+def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[Floats], Floats]:
+    """``a = mean + σ ε`` with normal ε."""
+    noise = th.empty(n_envs, width)
+    epsilon = noise.numpy()
+    log_sigma = log_std.detach().numpy()
+
+    def sample(means: Floats) -> Floats:
+        noise.normal_()
+        actions: Floats = means + np.exp(log_sigma) * epsilon
+        return actions
+
+    return sample
+
+
+def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.ndarray]:
+    """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
+    noise = th.empty(n_envs, n_actions)
+    exponential = noise.numpy()
+
+    def sample(logits: Floats) -> np.ndarray:
+        noise.exponential_()
+        actions: np.ndarray = (logits - np.log(exponential)).argmax(axis=1)
+        return actions
+
+    return sample

@@ -1,9 +1,10 @@
 """
-Several parameter vectors acting side by side: environment i is acted in with vector i, in one forward pass.
+Several parameter vectors acting side by side: vector i in environment i.
 
-Three ways, the fastest that the policy allows: batched matrix products, ``torch.func``, or a loop over environments.
+Plain actors act together, by batched matrix products; any other policy acts in one environment after the other.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,71 +13,101 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor, NatureCNN
 from stable_baselines3.common.utils import obs_as_tensor
-from torch.func import functional_call, vmap
 
+from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
 from sb3_reinforce.policies import parameters
-from sb3_reinforce.policies.plain_mlp import DISTRIBUTIONS, overrides
-
-# What an action goes through in ActorCriticPolicy; a policy with its own version of one of them is called as it is
-ACTION_METHODS = ("predict", "_predict", "get_distribution", "_get_action_dist_from_latent", "obs_to_tensor")
+from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, temperature_hooks
 
 
-class MatrixActor:
+class CandidateActor(ABC):
+    """Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters."""
+
+    @abstractmethod
+    def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
+        """From now on, act with candidates of shape ``(m, n)`` in ``m`` environments."""
+
+    @abstractmethod
+    def act(self, obs: Any) -> np.ndarray:
+        """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
+
+
+class LoopActor(CandidateActor):
     """
-    Batched matrix products, for actors made of linear layers and activation functions.
+    The policy's own ``predict``, in one environment after the other, for any policy.
 
-    :param policy: The policy, which is not changed
-    :param actor: Its parameters that make up θ
-    :param n_envs: Number of vectors that act side by side
-    :param deterministic: Whether to take the most likely action instead of a sample
+    A candidate is in the policy only while it predicts. A deep copy would not do: hooks and replaced methods may refer
+    to the policy that they were made for, and policies that hold a graph, as with gSDE, cannot be copied.
     """
 
-    def __init__(self, policy: ActorCriticPolicy, actor: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool):
-        self.policy, self.actor, self.deterministic, self.device = policy, actor, deterministic, policy.device
-        self._as_env_actions = env_actions_of(policy, n_envs)
-        # Matrices lie in memory as they are multiplied, transposed, which halves the price of a product
-        self.stacks = [p.detach().mT.repeat(n_envs, 1, 1).mT if p.dim() == 2 else repeated(p, n_envs) for p in actor]
-        self._stack_of = {id(p): stack for p, stack in zip(actor, self.stacks, strict=True)}
-        self._build(n_envs)
-
-    def _build(self, n_envs: int) -> None:
-        """Views of the stacks as matrices that multiply from the right; a frozen layer has one value for all."""
-
-        def stacked(parameter: th.Tensor) -> th.Tensor:
-            return self._stack_of.get(id(parameter), repeated(parameter, n_envs))
-
-        self._layers = [
-            (stacked(layer.weight).mT, stacked(layer.bias)[:, None]) if isinstance(layer, th.nn.Linear) else layer
-            for layer in layers_of(self.policy)
-        ]
-        space, extractor = self.policy.observation_space, self.policy.pi_features_extractor
-        self._is_vector = (
-            isinstance(space, spaces.Box) and len(space.shape) == 1 and type(extractor) is FlattenExtractor
-        )
+    def __init__(
+        self, policy: ActorCriticPolicy, searched: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool
+    ):
+        self.policy = policy
+        self.searched = searched
+        self.deterministic = deterministic
+        self.thetas = parameters.read(searched).repeat(n_envs, 1)
 
     def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
-        """
-        From now on, act with these parameters.
+        self.thetas[envs] = thetas
 
-        :param envs: ``m`` environments
-        :param thetas: Their parameter vectors, shape ``(m, n)``
-        """
-        for stack, values in zip(self.stacks, parameters.split(thetas, self.actor), strict=True):
+    @uninterrupted
+    def act(self, obs: Any) -> np.ndarray:
+        centre = parameters.read(self.searched)
+        actions = []
+        try:
+            for i, theta in enumerate(self.thetas):
+                parameters.write(self.searched, theta)
+                action, _ = self.policy.predict(row(obs, i), deterministic=self.deterministic)
+                actions.append(action)
+        finally:
+            parameters.write(self.searched, centre)
+        return shift_to_start(self.policy.action_space, np.concatenate(actions))
+
+
+class MatrixActor(CandidateActor):
+    """Batched matrix products, for the layers of a plain actor."""
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        layers: Sequence[th.nn.Module],
+        searched: Sequence[th.nn.Parameter],
+        n_envs: int,
+        deterministic: bool,
+    ):
+        self.policy = policy
+        self.searched = searched
+        self.deterministic = deterministic
+        self.device = policy.device
+        self.takes_vectors = takes_vectors(policy, policy.pi_features_extractor)
+        self.as_env_actions = env_actions_of(policy, n_envs)
+        self.temperatures = [hook.temperature for hook in temperature_hooks(layers[-1])]
+
+        def stacked(parameter: th.Tensor) -> th.Tensor:
+            """The values for each environment, matrices transposed in memory, which halves the price of a product."""
+            values = parameter.detach()
+            return values.mT.repeat(n_envs, 1, 1).mT if values.dim() == 2 else values.repeat(n_envs, 1)
+
+        self.stacks = [stacked(parameter) for parameter in searched]
+        stack_of = {id(parameter): stack for parameter, stack in zip(searched, self.stacks, strict=True)}
+
+        def values(parameter: th.Tensor) -> th.Tensor:
+            """The stack of a searched parameter; a frozen one has the same values in all environments."""
+            return stack_of[id(parameter)] if id(parameter) in stack_of else stacked(parameter)
+
+        self.operations = [
+            (values(layer.weight).mT, values(layer.bias)[:, None]) if isinstance(layer, th.nn.Linear) else layer
+            for layer in layers
+        ]
+
+    def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
+        for stack, values in zip(self.stacks, parameters.split(thetas, self.searched), strict=True):
             stack[envs] = values
 
     def act(self, obs: Any) -> np.ndarray:
-        """
-        The actions of all environments, as the environments take them.
-
-        :param obs: Observations of the environments
-        :return: Shape ``(n_envs, *action_space.shape)``
-        """
         policy = self.policy
-        # No gradient is recorded: the stacks are no leaves of a graph
         outputs = self.outputs(obs)
         if self.deterministic:
             actions = mode(outputs, policy.action_space)
@@ -84,150 +115,51 @@ class MatrixActor:
             actions = policy.action_dist.proba_distribution(outputs, policy.log_std.detach()).sample()
         else:
             actions = policy.action_dist.proba_distribution(action_logits=outputs).sample()
-        space = policy.action_space
-        return self._as_env_actions(actions.cpu().numpy().reshape(-1, *space.shape))  # type: ignore[misc]
-
-    def _features(self, obs: Any) -> th.Tensor:
-        if self._is_vector:
-            # What the lines below do to vectors, for a tenth of their price
-            return th.from_numpy(obs).to(self.device, th.float32)
-        obs = obs_as_tensor(obs, self.device)
-        return BasePolicy.extract_features(self.policy, obs, self.policy.pi_features_extractor)
+        shape: Any = policy.action_space.shape
+        return self.as_env_actions(actions.cpu().numpy().reshape(-1, *shape))
 
     def outputs(self, obs: Any) -> th.Tensor:
-        """
-        What the action net returns: means or logits.
-
-        :param obs: Observations of the environments
-        :return: Shape ``(n_envs, n_outputs)``
-        """
-        x = self._features(obs)[:, None]
-        for layer in self._layers:
-            x = th.baddbmm(layer[1], x, layer[0]) if isinstance(layer, tuple) else layer(x)
+        """Means or logits, shape ``(n_envs, n_outputs)``, without a graph, since the stacks require no gradient."""
+        x = self.features(obs)[:, None]
+        for operation in self.operations:
+            if isinstance(operation, tuple):
+                weight, bias = operation
+                x = th.baddbmm(bias, x, weight)
+            else:
+                x = operation(x)
+        for temperature in self.temperatures:
+            x = x / temperature
         return x[:, 0]
 
-
-class VmapActor(MatrixActor):
-    """``torch.func``, for actors whose features extractor has parameters: images, and dicts with images."""
-
-    def _build(self, n_envs: int) -> None:
-        module = th.nn.Sequential(self.policy.pi_features_extractor, *layers_of(self.policy))
-        module.eval()
-        values = {name: self._stack_of.get(id(p)) for name, p in module.named_parameters()}
-        stacks = {name: stack for name, stack in values.items() if stack is not None}
-        rest = {name: p.detach() for name, p in module.named_parameters() if values[name] is None}
-
-        def forward(stacks: dict[str, th.Tensor], obs: Any) -> th.Tensor:
-            # One observation at a time: layers see a batch of one
-            batch = {key: part[None] for key, part in obs.items()} if isinstance(obs, dict) else obs[None]
-            return functional_call(module, {**rest, **stacks}, (batch,))[0]  # type: ignore[no-any-return]
-
-        self._forward = vmap(forward)
-        self._named_stacks = stacks
-
-    def outputs(self, obs: Any) -> th.Tensor:
-        policy = self.policy
-        obs = obs_as_tensor(obs, self.device)
-        preprocessed = preprocess_obs(obs, policy.observation_space, normalize_images=policy.normalize_images)
-        return self._forward(self._named_stacks, preprocessed)
+    def features(self, obs: Any) -> th.Tensor:
+        """The observations in a row, shape ``(n_envs, n_features)``."""
+        if self.takes_vectors:
+            # The result of the lines below, for a tenth of their price
+            return th.from_numpy(obs).to(self.device, th.float32).flatten(1)
+        return BasePolicy.extract_features(
+            self.policy, obs_as_tensor(obs, self.device), self.policy.pi_features_extractor
+        )
 
 
-class Predict(th.nn.Module):
-    """
-    ``predict`` as a module, so that ``torch.func`` can call it with other parameters and put back the policy's own.
-
-    :param policy: The policy
-    :param deterministic: Whether to take the most likely action instead of a sample
-    """
-
-    def __init__(self, policy: ActorCriticPolicy, deterministic: bool):
-        super().__init__()
-        self.policy, self.deterministic = policy, deterministic
-
-    def forward(self, obs: Any) -> np.ndarray:
-        return self.policy.predict(obs, deterministic=self.deterministic)[0]
+def row(obs: Any, i: int) -> Any:
+    """Observation i as a batch of one."""
+    if isinstance(obs, dict):
+        return {key: part[i : i + 1] for key, part in obs.items()}
+    return obs[i : i + 1]
 
 
-class LoopActor(MatrixActor):
-    """The policy's own ``predict``, called for one environment after the other: for any policy at all."""
-
-    def _build(self, n_envs: int) -> None:
-        self._predict = Predict(self.policy, self.deterministic)
-        names = {id(parameter): name for name, parameter in self._predict.named_parameters()}
-        self._named_stacks = {names[id(p)]: stack for p, stack in zip(self.actor, self.stacks, strict=True)}
-
-    def act(self, obs: Any) -> np.ndarray:
-        actions = []
-        for i in range(len(self.stacks[0])):
-            own = {key: part[i : i + 1] for key, part in obs.items()} if isinstance(obs, dict) else obs[i : i + 1]
-            values = {name: stack[i] for name, stack in self._named_stacks.items()}
-            actions.append(functional_call(self._predict, values, (own,)))
-        return shift_to_start(self.policy.action_space, np.concatenate(actions))
-
-
-def make_actor(
-    policy: ActorCriticPolicy, actor: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool
-) -> MatrixActor:
-    """
-    The fastest way to act that gives the actions that the policy would.
-
-    :param policy: The policy
-    :param actor: Its parameters that make up θ
-    :param n_envs: Number of vectors that act side by side
-    :param deterministic: Whether to take the most likely action instead of a sample
-    """
-    return actor_class(policy)(policy, actor, n_envs, deterministic)
-
-
-def actor_class(policy: ActorCriticPolicy) -> type[MatrixActor]:
-    """
-    Which way to act a policy allows.
-
-    :param policy: The policy
-    """
-    own_code = any(overrides(policy, method) for method in ACTION_METHODS)
-    if own_code or type(policy.mlp_extractor) is not MlpExtractor or type(policy.action_dist) not in DISTRIBUTIONS:
-        return LoopActor
-    # A temperature is a hook
-    plain = all(
-        (layer.bias is not None if type(layer) is th.nn.Linear else not list(layer.parameters()))
-        and not layer._forward_hooks
-        for layer in layers_of(policy)
-    )
-    extractor = policy.pi_features_extractor
-    if plain and not list(extractor.parameters()):
-        return MatrixActor
-    return VmapActor if type(extractor) in (FlattenExtractor, NatureCNN, CombinedExtractor) else LoopActor
-
-
-def repeated(parameter: th.Tensor, n_envs: int) -> th.Tensor:
-    """
-    The same values for every environment.
-
-    :param parameter: The values
-    :param n_envs: Number of environments
-    :return: Shape ``(n_envs, *parameter.shape)``
-    """
-    return parameter.detach().expand(n_envs, *parameter.shape).clone()
-
-
-def layers_of(policy: ActorCriticPolicy) -> list[th.nn.Module]:
-    """
-    The layers between the features and the means or logits.
-
-    :param policy: A policy with an ``MlpExtractor``
-    """
-    return [*policy.mlp_extractor.policy_net, policy.action_net]
+def make_candidate_actor(
+    policy: ActorCriticPolicy, searched: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool
+) -> CandidateActor:
+    """The faster of the two actors that takes the actions which the policy would take."""
+    layers = plain_actor(policy)
+    if layers is None:
+        return LoopActor(policy, searched, n_envs, deterministic)
+    return MatrixActor(policy, layers, searched, n_envs, deterministic)
 
 
 def mode(outputs: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
-    """
-    The most likely actions, without building a distribution, which would cost as much as the forward pass.
-
-    :param outputs: Means or logits, shape ``(n_envs, n_outputs)``
-    :param space: The action space
-    :return: Shape ``(n_envs, ...)``
-    """
+    """The most likely actions for means or logits of shape ``(n, n_outputs)``, without the price of a distribution."""
     if isinstance(space, spaces.Discrete):
         return outputs.argmax(1)
     if isinstance(space, spaces.MultiDiscrete):

@@ -1,14 +1,12 @@
-"""
-How a rollout is collected: a number of steps per environment, or a quota of whole episodes per environment.
-
-It stands apart from ``rollouts``, which holds what was collected and the pure functions on it.
-"""
+"""How a rollout is collected: a number of steps per environment, or a quota of whole episodes per environment."""
 
 import warnings
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -16,26 +14,68 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.envs.checks import check_finite
-from sb3_reinforce.envs.stepping import stepper
-from sb3_reinforce.estimation.returns import Bools
-from sb3_reinforce.estimation.rollout import Extent
-from sb3_reinforce.sampling.actors import make_actor
+from sb3_reinforce.policies.evaluation import Route, route_of
+from sb3_reinforce.sampling.actors import Actor, make_actor
+
+Bools: TypeAlias = NDArray[np.bool_]
+# The terminal observation at each (step, environment) where a time limit ended an episode that counts
+TerminalObs: TypeAlias = dict[tuple[int, int], Any]
 
 # The arrays of a RolloutBuffer that have one row per step
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
 
 @dataclass(frozen=True)
-class Ends:
+class Extent:
     """
-    How the episodes of a rollout end.
+    When a rollout is complete: after ``n_steps`` per environment, or with ``quota`` episodes of each environment.
 
-    :param dones: Whether a step is the last of its episode, shape ``(n_steps, n_envs)``
-    :param terminal_obs: The terminal observation at each (step, environment) where a time limit ended the episode
+    An episode that is waited for and lasts longer than ``max_episode_steps`` counts as one that never ends.
     """
 
-    dones: Bools
-    terminal_obs: dict[tuple[int, int], Any]
+    n_steps: float
+    quota: NDArray[np.integer]
+    max_episode_steps: float
+
+    @classmethod
+    def fixed(cls, n_steps: int, n_envs: int) -> "Extent":
+        """The same number of steps in every environment, and as many episodes as end in them."""
+        return cls(n_steps, np.full(n_envs, n_steps), np.inf)
+
+    @classmethod
+    def whole_episodes(cls, n_episodes: int, n_envs: int, max_episode_steps: int) -> "Extent":
+        """Quotas that differ by at most 1, fixed beforehand: "the first to finish" would favour short episodes."""
+        quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
+        return cls(np.inf, quota, max_episode_steps)
+
+
+class Quota:
+    """The episodes that a rollout still waits for."""
+
+    def __init__(self, extent: Extent, n_envs: int):
+        self.extent = extent
+        self.remaining = extent.quota.copy()
+        self.starts = np.zeros(n_envs, dtype=int)
+        self.deadline = extent.max_episode_steps
+        self.is_complete = False
+
+    def check_length(self, n_steps: int) -> None:
+        """Refuse an episode that never ends."""
+        if n_steps == self.deadline:
+            raise ValueError(
+                f"An episode has not ended after max_episode_steps={self.extent.max_episode_steps} steps, and whole "
+                "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
+            )
+
+    def count(self, dones: Bools, n_steps: int) -> list[int]:
+        """Count the episodes that ended with this step; return the environments whose episode is in the quota."""
+        counted = np.flatnonzero(dones & (self.remaining > 0))
+        self.remaining[counted] -= 1
+        self.starts[counted] = n_steps
+        if self.extent.n_steps == np.inf:
+            self.is_complete = not self.remaining.any()
+            self.deadline = self.extent.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
+        return list(counted.tolist())
 
 
 def collect(
@@ -44,111 +84,101 @@ def collect(
     callback: BaseCallback,
     rollout_buffer: RolloutBuffer,
     extent: Extent,
-    with_critic: bool,
-) -> Ends | None:
+    route: Route,
+) -> tuple[Bools, TerminalObs] | None:
     """
-    Step the environments and write what happens into a rollout buffer, with one actor pass a step.
+    Step the environments and write what happens into a rollout buffer, which ends with one row per step.
 
-    :param model: The algorithm; its ``_last_obs`` and ``num_timesteps`` are kept up to date
-    :param env: The environments
-    :param callback: Called at each step, with the locals that the callbacks of Stable-Baselines3 read
-    :param rollout_buffer: The rollout buffer; it grows where it is too small and keeps one row per step. Its
-        ``log_probs`` are computed where a callback can read them, and 0 otherwise: training does not need them
-    :param extent: When the rollout is complete; what an environment does after its quota of episodes is not used
-    :param with_critic: Whether V(s) will be needed
-    :return: How the episodes ended; None if the callback stopped the collection
-    :raises ValueError: If an episode that is waited for does not end
-    :raises ConnectionError: If a worker of a ``SubprocVecEnv`` died
+    Returns ``dones`` of shape ``(n_steps, n_envs)`` and the terminal observations at time limits, or None if the
+    callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them: training has no use for
+    them.
     """
-    policy, actor, n_steps = model.policy, make_actor(model.policy, env.num_envs, with_critic), 0
-    as_env_actions, step, is_heard = env_actions_of(policy, env.num_envs), stepper(env), hears(callback)
+    policy = model.policy
+    is_attached = has_callback(callback)
+    actor = make_actor(policy, route, env.num_envs, keep_outputs=is_attached)
+    as_env_actions = env_actions_of(policy, env.num_envs)
+    quota = Quota(extent, env.num_envs)
     # A copy: some VecEnvs reuse the array of the dones
-    first, all_dones = np.array(model._last_episode_starts, dtype=bool), list[Bools]()
-    terminal_obs: dict[tuple[int, int], Any] = {}
-    owed, begun = extent.quota.copy(), np.zeros(env.num_envs, dtype=int)
-    deadline, waiting = extent.max_episode_steps, True
-    while n_steps < extent.n_steps and waiting:
-        if n_steps == deadline:
-            raise ValueError(
-                f"An episode has not ended after max_episode_steps={extent.max_episode_steps} steps, and whole "
-                "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
-            )
+    starts = [np.array(model._last_episode_starts, dtype=bool)]
+    terminal_obs: TerminalObs = {}
+    n_steps = first_row = 0
+    while n_steps < extent.n_steps and not quota.is_complete:
+        quota.check_length(n_steps)
         if n_steps == rollout_buffer.buffer_size:
             resize(rollout_buffer, 2 * n_steps)
         if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
         actions, values, log_probs = actor.act(model._last_obs)
-        write(rollout_buffer.observations, n_steps, model._last_obs)
-        write(rollout_buffer.actions, n_steps, actions)
+        write_row(rollout_buffer.observations, n_steps, model._last_obs)
+        write_row(rollout_buffer.actions, n_steps, actions)
         if values is not None and log_probs is not None:
-            write(rollout_buffer.values, n_steps, values)
-            write(rollout_buffer.log_probs, n_steps, log_probs)
+            write_row(rollout_buffer.values, n_steps, values)
+            write_row(rollout_buffer.log_probs, n_steps, log_probs)
 
+        if model.use_sde:
+            # Its standard deviation may overflow, and the environment would be blamed
+            check_finite("The action", actions, (None,))
         clipped_actions = as_env_actions(actions)
-        new_obs, rewards, dones, infos = step(clipped_actions)
+        new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
-        model._last_obs, model._last_episode_starts = new_obs, dones  # type: ignore[assignment]
-
-        if is_heard:
+        model._last_obs = new_obs  # type: ignore[assignment]
+        model._last_episode_starts = dones
+        if is_attached:
             callback.update_locals(locals())
             if not callback.on_step():
                 return None
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
-        all_dones.append(dones.astype(bool))
+        starts.append(dones.astype(bool))
+        n_steps += 1
+        rollout_buffer.pos = n_steps
         if np.count_nonzero(dones):
-            wanted = np.flatnonzero(all_dones[-1] & (owed > 0))
-            model._update_info_buffer([infos[i] for i in wanted], dones[wanted])
-            for i in wanted.tolist():
+            counted = quota.count(starts[-1], n_steps)
+            model._update_info_buffer([infos[i] for i in counted], dones[counted])
+            for i in counted:
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    terminal_obs[n_steps, i] = infos[i]["terminal_observation"]
-            owed[wanted] -= 1
-            begun[wanted] = n_steps + 1
-            if extent.n_steps == np.inf:
-                waiting = bool(owed.any())
-                deadline = extent.max_episode_steps + begun[owed > 0].min(initial=n_steps + 1)
-        rollout_buffer.pos = n_steps = n_steps + 1
+                    # Some VecEnvs write the next terminal observation into the same array
+                    terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
+        if is_attached and not actor.is_current(model.policy):
+            write_log_probs(rollout_buffer, actor, first_row)
+            policy = model.policy
+            actor = make_actor(policy, route_of(policy, route.with_critic), env.num_envs)
+            first_row = n_steps
     resize(rollout_buffer, n_steps)
-    rollout_buffer.full, ends = True, np.array(all_dones)
-    rollout_buffer.episode_starts[:] = np.vstack([first, ends[:-1]])
-    if log_probs is None and is_heard:
-        shape = rollout_buffer.rewards.shape
-        rollout_buffer.log_probs = actor.log_prob(rollout_buffer.observations, rollout_buffer.actions).reshape(shape)
-    return Ends(ends, terminal_obs)
+    rollout_buffer.full = True
+    rollout_buffer.episode_starts[:] = starts[:-1]
+    if is_attached:
+        write_log_probs(rollout_buffer, actor, first_row)
+    return np.array(starts[1:]), terminal_obs
 
 
-def hears(callback: BaseCallback) -> bool:
-    """
-    Whether anybody is told of the steps: of no callback at all, Stable-Baselines3 makes one that does nothing.
-
-    :param callback: What ``learn`` was given, as a callback
-    """
+def has_callback(callback: BaseCallback) -> bool:
+    """Whether a user's callback is attached; for ``callback=None`` SB3 installs a no-op, which need not be called."""
     return not (type(callback) is ConvertCallback and callback.callback is None)
 
 
-def write(rows: Any, step: int, values: Any) -> None:
-    """
-    Write one step into the rows of a rollout buffer.
-
-    :param rows: An array of shape ``(n_steps, n_envs, ...)``, or a dict of them
-    :param step: The row
-    :param values: As many elements as a row has, or a dict
-    """
+def write_row(rows: Any, step: int, values: Any) -> None:
+    """``rows[step] = values``, for an array of shape ``(n_steps, n_envs, ...)`` or a dict of them."""
     if isinstance(rows, dict):
         for key, part in rows.items():
-            write(part, step, values[key])
+            write_row(part, step, values[key])
     else:
         # Actions and observations of one number lack the last dimension
         rows[step] = values if values.ndim == rows.ndim - 1 else values.reshape(rows.shape[1:])
 
 
-def resize(buffer: RolloutBuffer, n_steps: int) -> None:
-    """
-    Give a rollout buffer another number of rows, keeping the rows that it has.
+def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None:
+    """Write log π of the rows from ``first_row`` on, unless the actor has computed them along with the actions."""
+    rows = slice(first_row, buffer.pos)
+    obs: Any = buffer.observations
+    obs = {key: part[rows] for key, part in obs.items()} if isinstance(obs, dict) else obs[rows]
+    log_probs = actor.log_prob(obs, buffer.actions[rows]) if first_row < buffer.pos else None
+    if log_probs is not None:
+        buffer.log_probs[rows] = log_probs.reshape(-1, buffer.n_envs)
 
-    :param buffer: The rollout buffer
-    :param n_steps: Its new number of rows
-    """
+
+def resize(buffer: RolloutBuffer, n_steps: int) -> None:
+    """Give a rollout buffer ``n_steps`` rows, and keep the rows that it has."""
 
     def resized(rows: Any) -> Any:
         if isinstance(rows, dict):
@@ -163,23 +193,15 @@ def resize(buffer: RolloutBuffer, n_steps: int) -> None:
         buffer.buffer_size = n_steps
 
 
-def by_step(buffer: RolloutBuffer, rows: np.ndarray) -> np.ndarray:
-    """
-    Rows of a rollout buffer step by step, also after ``get`` has put those of each environment one after the other.
-
-    :param buffer: The rollout buffer
-    :param rows: Its ``advantages`` or ``returns``
-    :return: Shape ``(n_steps, n_envs)``
-    """
-    return np.ascontiguousarray(rows.reshape(buffer.n_envs, -1).T) if buffer.generator_ready else rows
+def by_step(buffer: RolloutBuffer) -> tuple[np.ndarray, np.ndarray]:
+    """``advantages`` and ``returns`` as ``(n_steps, n_envs)``, also after ``get`` has flattened them env by env."""
+    if not buffer.generator_ready:
+        return buffer.advantages, buffer.returns
+    return buffer.advantages.reshape(buffer.n_envs, -1).T.copy(), buffer.returns.reshape(buffer.n_envs, -1).T.copy()
 
 
 def warn_of_own_methods(buffer: RolloutBuffer) -> None:
-    """
-    Warn where a user's rollout buffer would not be asked.
-
-    :param buffer: The rollout buffer
-    """
+    """Warn if a user's rollout buffer overrides a method that is not called."""
     for name in ("add", "compute_returns_and_advantage"):
         if getattr(type(buffer), name) not in (getattr(RolloutBuffer, name), getattr(DictRolloutBuffer, name)):
             warnings.warn(
@@ -189,15 +211,8 @@ def warn_of_own_methods(buffer: RolloutBuffer) -> None:
             )
 
 
-def check_data(buffer: RolloutBuffer, last_obs: Any, terminal_obs: dict[tuple[int, int], Any]) -> None:
-    """
-    Check what the environments returned.
-
-    :param buffer: The rollout buffer, full or not
-    :param last_obs: The observations after the last step
-    :param terminal_obs: The terminal observations at time limits
-    :raises ValueError: Naming what is not finite, and the step and environment
-    """
+def check_rollout_data(buffer: RolloutBuffer, last_obs: Any, terminal_obs: TerminalObs) -> None:
+    """Raise a ValueError that names the step and environment if a reward or an observation is not finite."""
     check_finite("The reward", buffer.rewards)
     check_finite("The observation", buffer.observations)
     check_finite("The observation", last_obs, (buffer.pos,))

@@ -1,4 +1,4 @@
-"""VecNormalize during a comparison: one scale for all candidates, and nothing lost of what they saw."""
+"""VecNormalize during a comparison: one scale for all candidates, and no observation lost."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,12 +7,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 
-class Observed:
-    """
-    Statistics of observations before normalization.
-
-    :param vec_normalize: The wrapper that sees them
-    """
+class ObservationStatistics:
+    """Statistics of the observations below a VecNormalize since it was frozen."""
 
     def __init__(self, vec_normalize: VecNormalize):
         self.vec_normalize = vec_normalize
@@ -22,30 +18,26 @@ class Observed:
         self.seen = {key: RunningMeanStd(0.0, total.mean.shape) for key, total in self.totals.items()}
 
     def update(self) -> None:
-        """Take in the observations of the last step."""
-        obs = self.vec_normalize.get_original_obs() if self.seen else {}
-        for key, seen in self.seen.items():
-            seen.update(obs[key] if isinstance(obs, dict) else obs)
+        """Add the observations of the last step."""
+        if self.seen:
+            obs = self.vec_normalize.get_original_obs()
+            for key, seen in self.seen.items():
+                seen.update(obs[key] if isinstance(obs, dict) else obs)
 
     def hand_over(self) -> None:
-        """Let the wrapper's own statistics take in all of them."""
+        """Add all of them to the statistics of the VecNormalize."""
         for key, seen in self.seen.items():
             if seen.count:
                 self.totals[key].combine(seen)
 
 
 @contextmanager
-def frozen(vec_normalize: VecNormalize | None) -> Iterator[Observed | None]:
-    """
-    Freeze the statistics within the block; after it, if nothing was raised, they take in what was seen.
-
-    :param vec_normalize: The wrapper, None for none
-    :return: What to update with each step; None where the statistics are not learning
-    """
+def frozen(vec_normalize: VecNormalize | None) -> Iterator[ObservationStatistics | None]:
+    """Freeze a VecNormalize that is learning; after the block it learns what was observed, unless an error ended it."""
     if vec_normalize is None or not vec_normalize.training:
         yield None
         return
-    observed = Observed(vec_normalize)
+    observed = ObservationStatistics(vec_normalize)
     vec_normalize.training = False
     try:
         yield observed

@@ -1,24 +1,30 @@
 """
 REINFORCE and FiniteDifference in the RL Zoo, as ``reinforce`` and ``finite_difference``.
 
-Importing this package registers both, with their settings and their samplers for Optuna: a script around ``rl_zoo3``
-needs nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce --env CartPole-v1``.
+Importing this package registers both, with their settings and their Optuna samplers; a script around ``rl_zoo3`` needs
+nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce --env CartPole-v1``.
 """
 
 try:
-    import rl_zoo3
+    import rl_zoo3.train
 except ImportError as error:
-    raise ImportError(f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]'") from error
+    # Given its name, `python -m sb3_reinforce.zoo` prints the sentence without a traceback
+    raise ImportError(
+        f"sb3_reinforce.zoo needs the RL Zoo ({error}): pip install 'sb3-reinforce[zoo]', or pip install -e '.[zoo]' "
+        "in a clone of the repository",
+        name=__name__,
+    ) from error
 
-from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params
 
 from sb3_reinforce.zoo import samplers
 from sb3_reinforce.zoo.configuration import ALGORITHMS, HYPERPARAMS
-from sb3_reinforce.zoo.experiments import extend_experiments
+from sb3_reinforce.zoo.experiments import Experiment, make_experiment
 
-__all__ = ["ALGORITHMS", "HYPERPARAMS"]
+__all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 
 rl_zoo3.ALGOS.update(ALGORITHMS)
 HYPERPARAMS_SAMPLER.update(reinforce=samplers.sample_reinforce, finite_difference=samplers.sample_finite_difference)
-HYPERPARAMS_CONVERTER.update(reinforce=samplers.convert_reinforce, finite_difference=samplers.convert_finite_difference)
-extend_experiments()
+HYPERPARAMS_CONVERTER.update(reinforce=convert_onpolicy_params, finite_difference=samplers.convert_finite_difference)
+# The command train makes its experiment by this name
+rl_zoo3.train.ExperimentManager = make_experiment  # type: ignore[misc,assignment]

@@ -1,21 +1,21 @@
 """The RL Zoo's commands, with REINFORCE and FiniteDifference: ``python -m sb3_reinforce.zoo <command> ...``."""
 
 import argparse
-import difflib
+import contextlib
 import importlib
+import io
 import os
 import runpy
 import subprocess
 import sys
 from typing import Any
-from unittest import mock
 
 import gymnasium as gym
 from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.configuration import ConfigurationError
+from sb3_reinforce.zoo.configuration import ConfigurationError, closest
 
 FUNCTIONS = {
     "train": "rl_zoo3.train",
@@ -27,68 +27,47 @@ FUNCTIONS = {
 SCRIPTS = {"record_video": "rl_zoo3.record_video", "benchmark": "rl_zoo3.benchmark"}
 COMMANDS = (*FUNCTIONS, *SCRIPTS)
 CHECKED = ("train", "enjoy", "record_video", "benchmark")
-# What the extra brings and `import rl_zoo3` does not need
-EXTRA = {"matplotlib", "pandas", "requests", "rliable", "scipy", "seaborn"}
 NOT_OFFERED = {
-    "push_to_hub": "the Zoo's push_to_hub cannot be imported with any huggingface_sb3 that it can be installed with",
+    "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
     "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
     "record_training": "record the checkpoints one by one: record_video --load-checkpoint STEPS",
 }
 
 
-def run_script(module: str) -> None:
-    """
-    Run a script of the Zoo's. Its benchmark calls ``python enjoy.py`` in the current folder: let that be ours.
+class StorePython(utils.StoreDict):
+    """The Zoo's ``KEY:VALUE`` arguments, whose values are Python, with errors that name the text."""
 
-    :param module: The module that is a script
-    :raises ConfigurationError: If the benchmark cannot reach the Hugging Face hub
-    """
-    call, ask_hub = subprocess.call, utils.get_hf_trained_models
-
-    def call_enjoy(command: list[str], **kwargs: Any) -> int:
-        if command[:2] == ["python", "enjoy.py"]:
-            command = [sys.executable, "-m", "sb3_reinforce.zoo", "enjoy", *command[2:]]
-        return call(command, **kwargs)
-
-    def models_of_hub() -> dict[str, tuple[str, str]]:
-        try:
-            models: dict[str, tuple[str, str]] = ask_hub()
-        except (OSError, HTTPError) as error:
-            raise ConfigurationError(f"the Hugging Face hub does not answer ({error}): pass --no-hub") from error
-        return models
-
-    with (
-        mock.patch.object(subprocess, "call", call_enjoy),
-        mock.patch.object(utils, "get_hf_trained_models", models_of_hub),
-    ):
-        runpy.run_module(module, run_name="__main__")
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any) -> None:
+        stored = {}
+        for text in values:
+            if ":" not in text:
+                parser.error(f"{text!r} must be KEY:VALUE")
+            try:
+                super().__call__(parser, namespace, [text])  # type: ignore[no-untyped-call]
+            except Exception as error:
+                parser.error(f"the value of {text!r} must be Python ({error!r}); write a text as KEY:\"'TEXT'\"")
+            stored.update(getattr(namespace, self.dest))
+        setattr(namespace, self.dest, stored)
 
 
-def check_key_value(text: str) -> None:
-    """
-    Check an argument of the Zoo's kind, whose values are Python.
+def run_script(command: str) -> None:
+    """Run a script of the Zoo; its benchmark calls ``python enjoy.py``, which becomes the ``enjoy`` of this module."""
+    call = subprocess.call
 
-    :param text: KEY:VALUE
-    :raises ArgumentTypeError: If it is not
-    """
-    _, colon, value = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(f"{text!r} must be KEY:VALUE")
+    def call_enjoy(arguments: list[str]) -> int:
+        return call([sys.executable, "-m", "sb3_reinforce.zoo", "enjoy", *arguments[2:]])
+
+    if command == "benchmark":
+        # A file enjoy.py would have to lie in the user's folder, and `python` may be another interpreter
+        subprocess.call = call_enjoy  # type: ignore[assignment]
     try:
-        eval(value, dict(vars(utils)))
-    except Exception as error:
-        hint = f"of {text!r} the value must be Python, but it says {error!r}; write a text as KEY:\"'TEXT'\""
-        raise argparse.ArgumentTypeError(hint) from error
+        runpy.run_module(SCRIPTS[command], run_name="__main__")
+    finally:
+        subprocess.call = call
 
 
 def import_packages(command: str, arguments: list[str]) -> list[str]:
-    """
-    Import the packages that register environments.
-
-    :param command: The Zoo's command
-    :param arguments: Those of the command
-    :return: What the command is to get: the Zoo's record_video does not know ``--gym-packages``
-    """
+    """Import the packages of ``--gym-packages``, and return the arguments for a command that may not know this one."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--gym-packages", nargs="+", default=[])
     given, others = parser.parse_known_args(arguments)
@@ -98,46 +77,70 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
 
 def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -> None:
-    """
-    Say what is wrong with arguments that the Zoo would accept, ignore or stumble over.
-
-    :param parser: Exits with a sentence
-    :param command: The Zoo's command
-    :param arguments: Those of the command
-    """
+    """Exit with a sentence for arguments that the Zoo would ignore, or end with a traceback for."""
     known = argparse.ArgumentParser(parser.prog, parser.usage, add_help=False, allow_abbrev=False)
-    known.add_argument("--env")
-    known.add_argument("--algo")
-    known.add_argument("-f", "--folder")
+    known.add_argument("--env", default="CartPole-v1")
+    known.add_argument("--algo", default="ppo")
+    known.add_argument("--exp-id", type=int, default=0)
+    for name in ("--storage", "--study-name", "--trial-id", "--load-checkpoint"):
+        known.add_argument(name)
+    known.add_argument("-f", "--folder", default="rl-trained-agents")
     known.add_argument("-i", "--trained-agent")
-    known.add_argument("--storage")
-    known.add_argument("--study-name")
-    known.add_argument("--trial-id")
     known.add_argument("--log-dir", default="rl-trained-agents/")
-    known.add_argument("--no-hub", action="store_true")
+    for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
+        known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
-        known.add_argument(*names, nargs="+", type=check_key_value)
+        known.add_argument(*names, nargs="+", action=StorePython)
     given, _ = known.parse_known_args(arguments)
     if command == "benchmark":
-        if not os.path.isdir(given.log_dir):
-            parser.error(f"--log-dir {given.log_dir} is not a folder: pass that of your models, such as logs")
-        if given.no_hub and not utils.get_trained_models(given.log_dir):
-            parser.error(f"--log-dir {given.log_dir} holds no trained models: pass the folder that train has written")
+        check_benchmark(parser, given)
         return
-    if given.env is not None and given.env not in gym.registry:
-        near = difflib.get_close_matches(given.env, gym.registry, n=1)
+    if given.algo not in utils.ALGOS:
+        hint = closest(given.algo, utils.ALGOS) or f", only {', '.join(utils.ALGOS)}"
+        parser.error(f"there is no --algo {given.algo}{hint}")
+    if given.env not in gym.registry:
         parser.error(
-            f"--env {given.env} is not registered{f', but {near[0]} is' if near else ''}; an environment of another "
-            "package needs --gym-packages PACKAGE"
+            f"--env {given.env} is not registered (an environment of another package needs --gym-packages PACKAGE)"
+            f"{closest(given.env, gym.registry)}"
         )
+    for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
+        try:
+            if env_kwargs:
+                gym.make(given.env, **env_kwargs).close()
+        except TypeError as error:
+            parser.error(f"{option}: {error}")
     if command != "train":
-        if given.algo in ALGORITHMS and given.folder is None:
-            parser.error(f"there are no published models of {given.algo}: pass the folder of your own, such as -f logs")
+        check_model(parser, command, given)
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
     if given.trained_agent and not (given.trained_agent.endswith(".zip") and os.path.isfile(given.trained_agent)):
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
+
+
+def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.Namespace) -> None:
+    """Exit with a sentence where there is no model, unless it is one that the Zoo downloads."""
+    which = (given.load_best, given.load_checkpoint, given.load_last_checkpoint)
+    try:
+        # The command itself prints the same again
+        with contextlib.redirect_stdout(io.StringIO()):
+            utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env), *which)
+    except (AssertionError, ValueError) as error:
+        if command == "record_video" or given.algo in ALGORITHMS or "rl-trained-agents" not in given.folder:
+            parser.error(f"{error}: pass the folder of your models, such as -f logs, and their --algo and --env")
+
+
+def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Exit with a sentence where the benchmark would find no models."""
+    if not os.path.isdir(given.log_dir):
+        parser.error(f"--log-dir {given.log_dir} is not a folder: pass the folder of your models, such as logs")
+    if not given.no_hub:
+        try:
+            utils.get_hf_trained_models()
+        except (OSError, HTTPError) as error:
+            parser.error(f"the Hugging Face hub does not answer ({error}): pass --no-hub")
+    elif not utils.get_trained_models(given.log_dir):
+        parser.error(f"--log-dir {given.log_dir} holds no trained models: pass the folder that train has written")
 
 
 def main() -> None:
@@ -160,11 +163,9 @@ def main() -> None:
         if command in FUNCTIONS:
             getattr(importlib.import_module(FUNCTIONS[command]), command)()
         else:
-            run_script(SCRIPTS[command])
+            run_script(command)
     except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        hint = "it comes with pip install 'sb3-reinforce[zoo]'" if missing in EXTRA else "install it, or mend its name"
-        parser.error(f"{error}: {hint}")
+        parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))
     except ValueError as error:

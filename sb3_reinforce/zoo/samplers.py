@@ -1,28 +1,18 @@
 """
-What Optuna tries: a sampler for each algorithm, and what turns the values of a trial into arguments.
+What Optuna tries, as arguments of the algorithms.
 
-A trial stores what was suggested, such as a power of two; ``train --trial-id`` converts it again.
+A trial stores the suggested values, such as a power of two; ``train --trial-id`` converts them again.
 """
-
-from typing import Any
 
 import optuna
 from rl_zoo3.hyperparams_opt import convert_onpolicy_params
 
+from sb3_reinforce.zoo.configuration import Settings
 
-def sample_reinforce(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Settings of REINFORCE with a critic and fixed rollouts. ``policy_kwargs`` replaces that of the configuration.
 
-    :param trial: The trial
-    :param n_actions: Dimension of the actions, not used
-    :param n_envs: Environments, not used
-    :param additional_args: For replay buffers, not used
-    :return: Arguments of REINFORCE
-    """
-    return convert_reinforce(
+def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+    """Suggest arguments of REINFORCE with a critic and fixed rollouts; ``policy_kwargs`` replaces a configured one."""
+    arguments: Settings = convert_onpolicy_params(
         {
             "n_steps_pow": trial.suggest_int("n_steps_pow", 3, 9),
             "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 9),
@@ -36,29 +26,11 @@ def sample_reinforce(
             "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
         }
     )
-
-
-def convert_reinforce(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: What ``sample_reinforce`` has suggested
-    :return: Arguments of REINFORCE
-    """
-    arguments: dict[str, Any] = convert_onpolicy_params(sampled_params)
     return arguments
 
 
-def sample_finite_difference(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Settings of FiniteDifference, for the policy of the configuration.
-
-    :param trial: The trial
-    :param n_actions: Dimension of the actions, not used
-    :param n_envs: Environments, not used
-    :param additional_args: For replay buffers, not used
-    :return: Arguments of FiniteDifference
-    """
+def sample_finite_difference(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+    """Suggest arguments of FiniteDifference for the configured policy."""
     return convert_finite_difference(
         {
             "estimator": trial.suggest_categorical("estimator", ["central", "forward", "regression"]),
@@ -71,14 +43,11 @@ def sample_finite_difference(
     )
 
 
-def convert_finite_difference(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: What ``sample_finite_difference`` has suggested
-    :return: Arguments of FiniteDifference
-    """
+def convert_finite_difference(sampled_params: Settings) -> Settings:
+    """Convert the values of a trial to arguments of FiniteDifference."""
     arguments = dict(sampled_params)
     arguments["n_delta"] = 2 ** arguments.pop("n_delta_pow")
     best = max(1, round(arguments.pop("top_fraction") * arguments["n_delta"]))
-    # Always given, since the configuration may hold one that does not go with what was sampled
+    # Set in any case, since a configured n_top may not go with the sampled estimator
     arguments["n_top"] = best if arguments["estimator"] == "central" else None
     return arguments

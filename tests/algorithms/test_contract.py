@@ -521,7 +521,7 @@ def test_a_callback_may_shape_the_rewards_in_place():
 
 
 class Reused(VecEnvWrapper):
-    """Hands out the same array of dones at each step, as numbers."""
+    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
 
     def reset(self):
         return self.venv.reset()
@@ -530,13 +530,21 @@ class Reused(VecEnvWrapper):
         obs, rewards, dones, infos = self.venv.step_wait()
         self.dones = getattr(self, "dones", np.zeros(self.num_envs, dtype=np.uint8))
         self.dones[:] = dones
+        self.last = getattr(self, "last", np.zeros_like(obs))
+        for i in np.flatnonzero(dones):
+            self.last[i] = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = self.last[i]
         return obs, rewards, self.dones, infos
 
 
-def test_a_vec_env_may_reuse_its_array_of_dones():
-    env = Reused(make_vec_env(lambda: Corridor((3,)), 2))
-    model = REINFORCE("MlpPolicy", env, n_steps=9).learn(18)
-    assert model._rollout.dones[:, 0].tolist() == [False, False, True] * 3
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_a_vec_env_may_reuse_its_arrays(mode):
+    outcomes = []
+    for wrapper in (lambda env: env, Reused):
+        env = wrapper(make_vec_env(lambda: Corridor((2, 3, 5), truncate=True), 2, seed=0))
+        model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=TINY, **mode).learn(100)
+        outcomes.append([parameter.clone() for parameter in model.policy.parameters()])
+    assert all(map(th.equal, *outcomes))
 
 
 class OwnAdd(RolloutBuffer):

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.weights import normalized
+from sb3_reinforce.estimation.weights import standardize
 
 GAMMA = 0.5
 N_OBS = 5
@@ -196,7 +196,7 @@ def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
 def test_normalized_advantages_have_mean_zero_and_deviation_one():
     """The step with normalization is the step of weights shifted and scaled, denominator and all."""
     plain, before, _ = learn(1, 4, baseline="none", n_steps=16, normalize_advantage=True, reward_to_go=True)
-    used = plain._rollout.used.numpy()
+    used = plain.rollout.used.numpy()
     weights = plain.rollout_buffer.advantages[used].astype(np.float64)
     weights = (weights - weights.mean()) / weights.std(ddof=1)
     actions = plain.rollout_buffer.actions[used].ravel()
@@ -213,11 +213,11 @@ def test_the_entropy_bonus_raises_the_entropy_over_the_same_denominator(mode):
     plain, before, _ = learn(1, 4, baseline="none" if "n_episodes" in mode else "value", **mode)
     model, _, _ = learn(1, 4, baseline="none" if "n_episodes" in mode else "value", ent_coef=0.5, **mode)
     ours = step_of(model, before)["action_net.weight"] - step_of(plain, before)["action_net.weight"]
-    rollout = model._rollout
+    rollout = model.rollout
     weight = th.tensor(before["action_net.weight"], requires_grad=True)
     logits = rollout.observations[rollout.used].double() @ weight.T + th.tensor(before["action_net.bias"])
     entropy = -(logits.softmax(1) * logits.log_softmax(1)).sum()
-    expected = 0.5 * th.autograd.grad(entropy, weight)[0] / model._denominator(rollout)
+    expected = 0.5 * th.autograd.grad(entropy, weight)[0] / rollout.denominator
     np.testing.assert_allclose(ours, expected, atol=2e-4 * np.abs(step_of(plain, before)["action_net.weight"]).max())
     assert model.logger.name_to_value["train/entropy_loss"] == pytest.approx(-entropy.item() / len(logits), rel=1e-5)
 
@@ -285,11 +285,11 @@ def test_a_pass_of_the_critic_descends_its_error(max_grad_norm):
 
 
 @pytest.mark.parametrize("n", [1, 3, 32, 777])
-def test_weights_that_do_not_differ_are_not_normalized(n):
+def test_weights_that_do_not_differ_are_not_standardize(n):
     """Their deviation is 0 but for rounding, which must not be blown up."""
     same = th.full((n,), 123.4567)
-    assert th.equal(normalized(same), same)
-    assert normalized(th.tensor([1.0, 3.0])).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
+    assert th.equal(standardize(same), same)
+    assert standardize(th.tensor([1.0, 3.0])).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.5, 3.0])

@@ -18,13 +18,13 @@ from environments import Corridor
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.weights import normalized
+from sb3_reinforce.estimation.weights import standardize
 
 
 def test_normalized_weights_are_divided_by_their_deviation_not_its_square():
     weights = 7.0 * th.randn(1000, generator=th.Generator().manual_seed(0)) + 3
-    assert normalized(weights).std().item() == pytest.approx(1, rel=1e-5)
-    assert normalized(weights).mean().abs() < 1e-5
+    assert standardize(weights).std().item() == pytest.approx(1, rel=1e-5)
+    assert standardize(weights).mean().abs() < 1e-5
 
 
 @pytest.mark.parametrize("n_steps", [1, 2])

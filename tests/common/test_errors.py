@@ -1,19 +1,11 @@
 """A user's mistake gets an error that names the argument, its value and what is allowed, and nothing is lost."""
 
-import os
-import signal
-import threading
-
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
-from gymnasium import spaces
 from models import make, plain
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_reinforce import REINFORCE
 
@@ -36,24 +28,6 @@ def test_a_users_baseline_is_checked(baseline, error, words):
     assert "baseline" in str(caught.value) and all(word in str(caught.value) for word in words)
 
 
-class Faulty(Corridor):
-    """Goes wrong at one step: a reward, an observation, or an exception."""
-
-    def __init__(self, fault, at=21, value=NAN, action_space=None, length=7, truncate=False):
-        super().__init__((length,), action_space=action_space, truncate=truncate)
-        self.fault, self.at, self.value, self.n = fault, at, value, 0
-
-    def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        if self.n == self.at:
-            if self.fault == "exception":
-                raise OSError("the simulator has gone")
-            reward = self.value if self.fault == "reward" else reward
-            obs = obs * self.value if self.fault == "observation" else obs
-        self.n += 1
-        return obs, reward, terminated, truncated, info
-
-
 def parameters_of(model):
     return [parameter.clone() for parameter in model.policy.parameters()]
 
@@ -67,44 +41,6 @@ def assert_saveable_and_trainable(model, path):
     assert all(parameter.isfinite().all() for parameter in loaded.policy.parameters())
     model.set_env(Corridor((7,), action_space=model.action_space))
     model.learn(64, reset_num_timesteps=False)
-
-
-@pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 2, "baseline": "none"}])
-@pytest.mark.parametrize("action_space", [spaces.Discrete(2), spaces.Box(-1, 1, (2,))])
-@pytest.mark.parametrize(
-    ("fault", "value"), [("reward", NAN), ("reward", -INF), ("observation", NAN), ("observation", INF)]
-)
-def test_data_that_are_not_finite_are_named_before_the_parameters_are_touched(
-    fault, value, action_space, mode, tmp_path
-):
-    model = REINFORCE("MlpPolicy", Faulty(fault, value=value, action_space=action_space), **mode)
-    updates = []
-
-    class Watch(BaseCallback):
-        def _on_step(self):
-            return True
-
-        def _on_rollout_end(self):
-            updates.append(parameters_of(self.model))
-
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=f"{fault} of environment 0 at step"):
-        model.learn(200, callback=Watch())
-    assert model._n_updates == len(updates)
-    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-    assert_saveable_and_trainable(model, tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    ("length", "truncate", "name"), [(8, True, "terminal observation"), (100, False, "observation")]
-)
-def test_the_last_observation_of_a_rollout_is_checked_too(length, truncate, name):
-    """Of the very last rollout, in which the critic's value of it would end up in the returns."""
-    env = Faulty("observation", at=7, length=length, truncate=truncate)
-    model = REINFORCE("MlpPolicy", env, n_steps=8)
-    before = parameters_of(model)
-    with pytest.raises(ValueError, match=name):
-        model.learn(8)
-    assert all(map(th.equal, before, model.policy.parameters()))
 
 
 def test_an_environment_that_never_ends_is_an_error_in_whole_episode_mode(tmp_path):
@@ -126,14 +62,6 @@ def test_the_limit_is_for_one_episode_not_for_all():
         REINFORCE("MlpPolicy", Corridor((7,)), n_episodes=5, baseline="none", max_episode_steps=6).learn(35)
 
 
-def test_an_exception_of_the_environment_passes_and_leaves_the_last_parameters(tmp_path):
-    model = REINFORCE("MlpPolicy", Faulty("exception"), n_steps=8)
-    with pytest.raises(OSError, match="the simulator has gone"):
-        model.learn(100)
-    assert model.num_timesteps == 21 and model._n_updates == 2
-    assert_saveable_and_trainable(model, tmp_path / "model")
-
-
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
     from sb3_reinforce.policies.evaluation import floor_std, set_temperature
 
@@ -141,32 +69,6 @@ def test_temperature_needs_an_action_net_and_min_std_a_log_std():
         set_temperature(th.nn.Linear(1, 1), 0.5)
     with pytest.raises(ValueError, match="log_std"):
         floor_std(th.nn.Linear(1, 1), 0.1)
-
-
-@pytest.mark.parametrize("start_method", ["fork", "forkserver"])
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_worker_that_dies_is_named_at_once(start_method, tmp_path):
-    """Also with fork, where the other worker holds its pipe open and a plain step would wait for ever."""
-    env = SubprocVecEnv([lambda: gym.make("CartPole-v1")] * 2, start_method=start_method)
-    model = REINFORCE("MlpPolicy", env, n_steps=8)
-
-    class Kill(BaseCallback):
-        def _on_step(self):
-            if self.n_calls == 20:
-                os.kill(env.processes[0].pid, signal.SIGKILL)
-                env.processes[0].join()
-            return True
-
-    # A hang would otherwise hold up the whole test run
-    watchdog = threading.Timer(60, env.processes[1].kill)
-    watchdog.start()
-    with pytest.raises(ConnectionError, match="worker of environment 0 died"):
-        model.learn(10_000, Kill())
-    watchdog.cancel()
-    assert env.processes[1].is_alive() and model._n_updates == 2
-    model.save(tmp_path / "model")
-    env.processes[1].kill()
-    env.closed = True
 
 
 # Finite gradients that lead to parameters that are not

@@ -8,11 +8,16 @@ import torch as th
 from enumeration import LOGITS, episode_terms, log_pi
 from environments import Tree
 
-from sb3_reinforce.diagnostics.bootstrap import interval, resamples
-from sb3_reinforce.diagnostics.estimator_comparison import estimator_row
-from sb3_reinforce.diagnostics.gradient_statistics import gradient_statistics
-from sb3_reinforce.diagnostics.moments import Moments, moments, noise_scale, signal_to_noise, variance
-from sb3_reinforce.diagnostics.tables import as_text
+from sb3_reinforce.diagnostics.estimator_comparison import judge
+from sb3_reinforce.diagnostics.statistics import (
+    Moments,
+    compute_moments,
+    gradient_statistics,
+    noise_scale,
+    signal_to_noise,
+    variance,
+)
+from sb3_reinforce.diagnostics.tables import as_text, interval, resamples
 
 MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
 FACTOR = th.randn(8, 8, dtype=th.float64, generator=th.Generator().manual_seed(3))
@@ -26,7 +31,7 @@ def draw(m, generator):
 
 def test_the_moments_are_those_of_the_sample_covariance():
     gradients = draw(12, th.Generator().manual_seed(0))
-    found = moments(gradients @ gradients.T, th.ones(1, 12, dtype=th.float64))
+    found = compute_moments(gradients @ gradients.T, th.ones(1, 12, dtype=th.float64))
     th.testing.assert_close(variance(found)[0], gradients.var(0).sum())
     th.testing.assert_close(found.second[0], gradients.square().sum(1).mean())
     th.testing.assert_close(found.signal[0], gradients.mean(0).square().sum() - gradients.var(0).sum() / 12)
@@ -34,7 +39,7 @@ def test_the_moments_are_those_of_the_sample_covariance():
 
 def test_counts_are_repeated_samples_without_their_pairs_with_themselves():
     gradients, counts = draw(4, th.Generator().manual_seed(1)), th.tensor([[3.0, 0.0, 2.0, 1.0]], dtype=th.float64)
-    found = moments(gradients @ gradients.T, counts)
+    found = compute_moments(gradients @ gradients.T, counts)
     labels = [0, 0, 0, 2, 2, 3]
     pairs = [gradients[i] @ gradients[j] for i, j in product(labels, repeat=2) if i != j]
     th.testing.assert_close(found.signal[0], th.stack(pairs).mean())
@@ -45,7 +50,7 @@ def test_counts_are_repeated_samples_without_their_pairs_with_themselves():
 def test_no_resample_has_a_negative_variance():
     """Three times 1 and once 2: half the squared distance of the only pair that differs, whatever the counts."""
     gradients, counts = th.tensor([[1.0], [2.0]]).double(), th.tensor([[3.0, 1.0], [1.0, 1.0]]).double()
-    assert variance(moments(gradients @ gradients.T, counts)).tolist() == [0.5, 0.5]
+    assert variance(compute_moments(gradients @ gradients.T, counts)).tolist() == [0.5, 0.5]
     found = gradient_statistics(draw(3, th.Generator().manual_seed(0)), n_resamples=2000)
     assert found.variance.low > 0
 
@@ -60,7 +65,7 @@ def test_variance_and_signal_are_unbiased_on_the_tree():
     expected = th.zeros(2, dtype=th.float64)
     for sample in product(range(len(trajectories)), repeat=3):
         chosen = gradients[list(sample)]
-        found = moments(chosen @ chosen.T, th.ones(1, 3, dtype=th.float64))
+        found = compute_moments(chosen @ chosen.T, th.ones(1, 3, dtype=th.float64))
         expected += p[list(sample)].prod() * th.stack([variance(found)[0], found.signal[0]])
     th.testing.assert_close(expected, th.stack([trace, signal]), rtol=0, atol=1e-10)
 
@@ -104,8 +109,7 @@ def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same
         gradients, others = draw(m, generator) + shift, draw(m, generator) + shift + scale * th.ones(8)
         found = gradient_statistics(gradients, reference, n_resamples=200, seed=seed).cosine
         covered += found.low <= truth <= found.high
-        counts, other_counts = resamples(m, 200, seed), resamples(m, 200, seed + 1000)
-        found = estimator_row("", gradients, others, 1, 1, counts, other_counts, 0.95).cosine
+        found = judge(gradients, others, 200, 0.95, seed)[0]
         both += found.low <= truth <= found.high
     assert min(covered, both) >= 450, (covered, both)
 
@@ -122,10 +126,10 @@ def test_the_noise_of_the_reference_does_not_lower_the_cosine():
     """With the norm of the mean of 40 noisy samples it would be too small by a factor near √(1 / 1.13) = 0.94."""
     generator, shift = th.Generator().manual_seed(2), th.tensor([1.0, 1, 1, 1, 0, 0, 0, 0], dtype=th.float64)
     truth = float(MEAN @ (MEAN + shift) / MEAN.norm() / (MEAN + shift).norm())
-    counts, values = (resamples(400, 1, 0), resamples(40, 1, 0)), []
+    values = []
     for _ in range(400):
         gradients, reference = draw(400, generator), draw(40, generator) + shift
-        values.append(estimator_row("", gradients, reference, 1, 1, *counts, 0.95).cosine.value)
+        values.append(judge(gradients, reference, 1, 0.95, 0)[0].value)
     assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
 
 

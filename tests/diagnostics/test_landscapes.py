@@ -13,8 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
+from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
-from sb3_reinforce.diagnostics.likelihood_ratio import likelihood_ratio
 
 
 def bandit(algorithm=REINFORCE, **kwargs):
@@ -108,28 +108,6 @@ def test_by_default_every_estimator_sees_something_on_cartpole():
 
 def test_a_single_name_is_an_estimator():
     assert compare_estimators(bandit(), 10, 3, "central").names == ["central"]
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_the_seed_makes_it_reproducible_and_leaves_the_generator_and_the_mode(training):
-    """A task whose episodes are drawn by the environment's own generator, and actions by PyTorch's."""
-    env = make_vec_env(lambda: Corridor((1, 2, 5), lambda t, action: float(action)), 4, seed=0)
-    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
-    model.policy.set_training_mode(training)
-
-    def figures(seed):
-        rows = compare_estimators(model, 12, 4, n_resamples=20, seed=seed).to_records()
-        return [{key: x for key, x in row.items() if key != "seconds"} for row in rows]
-
-    before = th.get_rng_state()
-    first = figures(3)
-    np.testing.assert_equal(figures(3), first)
-    assert figures(4)[0]["snr_per_step"] != first[0]["snr_per_step"]
-    utilities = [landscape(model, n_points=2, seed=1).utilities for _ in range(2)]
-    np.testing.assert_equal(*utilities)
-    compare_baselines(model, 5, n_resamples=2)
-    assert th.equal(th.get_rng_state(), before)
-    assert model.policy.training == training
 
 
 def test_other_models_are_refused():

@@ -1,82 +1,21 @@
 """Faults of environments are named where they come in, before parameters or statistics are touched by them."""
 
-import gc
-import os
-import signal
-import threading
-import time
 from copy import deepcopy
 
 import cloudpickle
 import numpy as np
 import pytest
 import torch as th
-from environments import Corridor
+from environments import Corridor, Faulty
 from gymnasium import spaces
-from models import KINDS, make
-from stable_baselines3.common.callbacks import BaseCallback
+from models import KINDS, make, plain
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    SubprocVecEnv,
-    VecEnvWrapper,
-    VecFrameStack,
-    VecMonitor,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
-LENGTH = 7
 all_kinds = pytest.mark.parametrize("kind", KINDS)
-
-
-class Faulty(Corridor):
-    """
-    Does something at one step of its life, or at one reset.
-
-    :param fault: What: returns a reward, an observation, or raises, or dies
-    :param at: When
-    :param value: What it returns then
-    :param truncate: Whether episodes end by truncation
-    :param observation_space: Its space, if it is another
-    """
-
-    def __init__(self, fault=None, at=0, value=None, truncate=False, observation_space=None):
-        super().__init__((LENGTH,), truncate=truncate)
-        self.observation_space = observation_space or self.observation_space
-        self.fault, self.at, self.value, self.n_steps, self.n_resets = fault, at, value, 0, 0
-
-    def observe(self):
-        if self.observation_space.shape == (LENGTH,):
-            return super().observe()
-        return np.zeros(self.observation_space.shape, self.observation_space.dtype)
-
-    def reset(self, *, seed=None, options=None):
-        obs, info = super().reset(seed=seed, options=options)
-        self.n_resets += 1
-        if self.n_resets == self.at:
-            self.go_wrong("reset")
-            obs = self.value if self.fault == "first observation" else obs
-        return obs, info
-
-    def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        self.n_steps += 1
-        if self.n_steps == self.at:
-            self.go_wrong("step")
-            reward = self.value if self.fault == "reward" else reward
-            obs = self.value if self.fault == "observation" else obs
-        return obs, reward, terminated, truncated, info
-
-    def go_wrong(self, when):
-        if self.fault == f"raise in {when}":
-            raise OSError("the simulator has gone")
-        if self.fault == f"die in {when}":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.fault in signal.Signals.__members__ and when == "step":
-            os.kill(os.getppid(), signal.Signals[self.fault])
-            # The answer comes when the learner has long stopped waiting for it
-            time.sleep(0.2)
 
 
 def of_two(**fault):
@@ -91,7 +30,7 @@ def statistics(env):
 
 
 def bad(value):
-    return np.array([value, *[0] * (LENGTH - 1)], dtype=np.float32)
+    return np.array([value, *[0] * 6], dtype=np.float32)
 
 
 NOT_FINITE = {
@@ -110,7 +49,7 @@ NOT_FINITE = {
 @all_kinds
 @pytest.mark.parametrize("normalized", [False, True])
 @pytest.mark.parametrize("name", NOT_FINITE)
-def test_numbers_that_are_not_finite(name, normalized, kind, tmp_path):
+def test_numbers_that_are_not_finite(name, normalized, kind):
     if name == "reset before training" and kind == "search" and not normalized:
         pytest.skip("The search resets the environments again, and no statistics have seen it")
     env = of_two(**NOT_FINITE[name])
@@ -121,10 +60,6 @@ def test_numbers_that_are_not_finite(name, normalized, kind, tmp_path):
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     if normalized:
         assert all(np.isfinite(part).all() for part in statistics(env)) and env.training
-        assert type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
-    model.save(tmp_path / "model")
-    assert KINDS[kind][0].load(tmp_path / "model", env=of_two()).learn(32).num_timesteps >= 32
-    if normalized:
         env.venv = of_two()
         model.learn(32, reset_num_timesteps=False)
         assert all(np.isfinite(part).all() for part in statistics(env))
@@ -154,37 +89,72 @@ def test_statistics_are_those_before_the_bad_step(kind):
 @pytest.mark.parametrize("kind", ["steps", "episodes"])
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_a_terminal_observation_behind_vec_normalize(kind, value):
-    env = VecFrameStack(VecNormalize(of_two(fault="observation", at=LENGTH, value=bad(value), truncate=True)), 2)
+    env = VecFrameStack(VecNormalize(of_two(fault="observation", at=7, value=bad(value), truncate=True)), 2)
     with pytest.raises(ValueError, match=r"terminal observation of environment 1 is not finite.*step 6 since"):
         make(kind, env).learn(100)
 
 
-def test_an_observation_of_the_very_last_step():
-    model = make("steps", of_two(fault="observation", at=8, value=bad(NAN)))
-    before = [parameter.clone() for parameter in model.policy.parameters()]
-    with pytest.raises(ValueError, match="observation of environment 1"):
-        model.learn(16)
-    assert all(map(th.equal, before, model.policy.parameters()))
+@pytest.mark.parametrize("truncate", [True, False])
+def test_an_observation_of_the_very_last_step(truncate):
+    """In which the critic's value of it would end up in the returns."""
+    at = 7 if truncate else 8
+    model = make("steps", Faulty("observation", at=at, value=bad(NAN), truncate=truncate), n_steps=at)
+    before = plain(model.policy.state_dict())
+    with pytest.raises(ValueError, match="observation of environment 0"):
+        model.learn(at)
+    assert plain(model.policy.state_dict()) == before
+
+
+class Watch(BaseCallback):
+    """Keeps the parameters of the last step."""
+
+    def _on_step(self):
+        self.seen = plain(self.model.policy.state_dict())
+        return True
+
+
+@all_kinds
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        (dict(fault="raise in step", value=KeyboardInterrupt()), KeyboardInterrupt),
+        (dict(fault="raise in step"), OSError),
+        (dict(fault="reward", value=NAN), ValueError),
+        (dict(fault="observation", value=bad(INF)), ValueError),
+    ],
+)
+def test_after_a_fault_the_model_is_the_last_good_one(fault, error, wrapper, kind, tmp_path):
+    """It can be saved, and goes on."""
+    env, callback = wrapper(of_two(at=52, **fault)), Watch()
+    model = make(kind, env)
+    with pytest.raises(error):
+        model.learn(400, callback=callback)
+    assert model._n_updates > 0 and plain(model.policy.state_dict()) == callback.seen
+    model.save(tmp_path / "model")
+    loaded = KINDS[kind][0].load(tmp_path / "model", env=of_two())
+    assert plain(loaded.policy.state_dict()) == callback.seen and loaded.learn(32).num_timesteps >= 32
+    assert model.learn(32, reset_num_timesteps=False).num_timesteps >= 32
 
 
 MALFORMED = {
-    "too long": np.zeros(LENGTH + 1, np.float32),
+    "too long": np.zeros(8, np.float32),
     "one number": np.zeros(1, np.float32),
     "a scalar": 0.0,
     "a string": "x",
-    "strings": np.array(["x"] * LENGTH),
+    "strings": np.array(["x"] * 7),
     "None": None,
     "a dict": {"x": 1},
-    "complex": np.ones(LENGTH) * 1j,
-    "objects": np.array([None] * LENGTH),
+    "complex": np.ones(7) * 1j,
+    "objects": np.array([None] * 7),
     "ragged": [[0.0], [0.0, 1.0]],
 }
 # Where the second environment returns it, and in which step of all of them
 WHEN = {
     "step": (dict(fault="observation", at=5), 4),
-    "end": (dict(fault="observation", at=LENGTH), LENGTH - 1),
-    "truncation": (dict(fault="observation", at=LENGTH, truncate=True), LENGTH - 1),
-    "reset": (dict(fault="first observation", at=2), LENGTH - 1),
+    "end": (dict(fault="observation", at=7), 6),
+    "truncation": (dict(fault="observation", at=7, truncate=True), 6),
+    "reset": (dict(fault="first observation", at=2), 6),
 }
 WRAPPERS = {"bare": lambda env: env, "monitor": VecMonitor, "normalize": VecNormalize}
 
@@ -201,19 +171,6 @@ def test_observations_of_another_form(wrapper, when, name, kind):
     with pytest.raises(ValueError, match=rf"observation of environment 1 must .*\(step {step} since learn\(\) began\)"):
         model.learn(400)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-
-
-@pytest.mark.parametrize("wrapper", ["bare", "normalize"])
-@pytest.mark.parametrize("when", WHEN)
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_observations_of_another_form_from_a_worker(when, wrapper):
-    fault, step = WHEN[when]
-    for name in ("too long", "a string", "complex"):
-        env = of_three("fork", value=MALFORMED[name], **fault)
-        model = make("steps", WRAPPERS[wrapper](env))
-        with pytest.raises(ValueError, match=rf"observation of environment 1 must .*\(step {step} since"):
-            model.learn(400)
-        env.close()
 
 
 @all_kinds
@@ -269,13 +226,36 @@ def test_rewards_that_are_no_numbers(wrapper, value, kind):
         model.learn(400)
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_rewards_of_a_worker_that_are_no_numbers():
-    for value in ("x", np.ones(2), 1j):
-        env = of_three("fork", fault="reward", at=5, value=value)
-        with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
-            make("steps", env).learn(400)
-        env.close()
+@all_kinds
+@pytest.mark.parametrize("value", ["x", np.ones(1), np.ones(2), None], ids=repr)
+def test_rewards_that_monitor_cannot_add_up(value, kind):
+    faults = [{}, dict(fault="reward", at=5, value=value)]
+    env = DummyVecEnv([lambda fault=fault: Monitor(Faulty(**fault)) for fault in faults])
+    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number, got .*\(step 4 since"):
+        make(kind, env).learn(400)
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
+@pytest.mark.parametrize("kind", ["steps", "episodes"])
+def test_actions_that_are_not_finite_are_not_blamed_on_the_environment(kind, wrapper):
+    """The standard deviation of gSDE overflows."""
+    model = make(kind, wrapper(make_vec_env("Pendulum-v1", 2)), use_sde=True)
+    model.policy.log_std.data.fill_(90.0)
+    with pytest.raises(ValueError, match=r"action of environment 0 is not finite.*\(step 0 since"):
+        model.learn(400)
+
+
+class Picky(Corridor):
+    """Refuses an action with an error of its own."""
+
+    def step(self, action):
+        raise TypeError("the action is not to my taste")
+
+
+@all_kinds
+def test_errors_of_an_environment_below_monitor_are_its_own(kind):
+    with pytest.raises(TypeError, match="taste"):
+        make(kind, Picky()).learn(8)
 
 
 @all_kinds
@@ -283,83 +263,6 @@ def test_rewards_of_a_worker_that_are_no_numbers():
 def test_forms_that_stand_for_a_reward_are_taken(value, kind):
     model = make(kind, Corridor((3,), reward=lambda t, action: value)).learn(32)
     assert model.ep_info_buffer[0]["r"] == 3 * float(value)
-
-
-def of_three(start_method, **fault):
-    truncate = {"truncate": fault.get("truncate", False)}
-    envs = [lambda: Faulty(**truncate), lambda: Faulty(**fault), lambda: Faulty(**truncate)]
-    return SubprocVecEnv(envs, start_method=start_method)
-
-
-def end(env):
-    """End the workers, and let a hang of the test itself not last."""
-    for process in env.processes:
-        process.kill()
-        process.join()
-    env.closed = True
-
-
-@pytest.mark.parametrize("kind", ["episodes", "search"])
-@pytest.mark.parametrize(
-    ("start_method", "fault"),
-    [
-        *(("fork", f"{end} in {when}") for end in ("raise", "die") for when in ("step", "reset")),
-        ("forkserver", "raise in step"),
-        ("spawn", "raise in step"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_worker_that_goes_wrong_is_named_with_its_exception(fault, start_method, kind, tmp_path):
-    env = of_three(start_method, fault=fault, at=2)
-    model = make(kind, env, **({"common_random_numbers": True} if kind == "search" else {}))
-    watchdog = threading.Timer(60, end, [env])
-    watchdog.start()
-    end_of_it = r"raised OSError: the simulator has gone" if "raise" in fault else "was killed by SIGKILL"
-    with pytest.raises(ConnectionError, match=f"worker of environment 1 died: it {end_of_it}"):
-        model.learn(10_000)
-    env.close()
-    watchdog.cancel()
-    assert all(not process.is_alive() for process in env.processes)
-    model.save(tmp_path / "model")
-    model.set_env(DummyVecEnv([Faulty] * 3))
-    assert model.learn(32).num_timesteps >= 32
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_the_only_worker_dies():
-    """Nobody else holds its end of the pipe open then."""
-    env = SubprocVecEnv([lambda: Faulty(fault="die in step", at=2)], start_method="fork")
-    with pytest.raises(ConnectionError, match="worker of environment 0 died: it was killed by SIGKILL"):
-        make("steps", env).learn(24)
-    env.close()
-    assert env.closed
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_worker_that_died_between_two_runs():
-    """The plain VecEnv would wait for ever in its reset, and in a call of a callback."""
-    env = of_three("fork")
-    model = make("steps", env).learn(24)
-    env.processes[1].kill()
-    watchdog = threading.Timer(60, end, [env])
-    watchdog.start()
-    for call in (lambda: model.learn(24), env.reset, lambda: env.get_attr("n_steps")):
-        with pytest.raises(ConnectionError, match="worker of environment 1 died: it was killed by SIGKILL"):
-            call()
-    watchdog.cancel()
-    end(env)
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_folder_for_the_workers_notes_is_removed_with_the_environment():
-    env = of_three("fork")
-    make("steps", env).learn(24)
-    folder = env.remotes[0].note.parent
-    assert folder.is_dir()
-    env.close()
-    del env
-    gc.collect()
-    assert not folder.exists()
 
 
 class Twice(VecEnvWrapper):
@@ -377,42 +280,10 @@ class Twice(VecEnvWrapper):
 
 
 def test_wrappers_that_make_several_steps_are_guarded_too():
-    env = VecNormalize(Twice(of_two(fault="reward", at=5, value=NAN)))
+    env = VecNormalize(Twice(of_two(fault="reward", at=6, value=NAN)))
     with pytest.raises(ValueError, match="reward of environment 1"):
         make("steps", env).learn(400)
     assert all(np.isfinite(part).all() for part in statistics(env))
-
-
-@pytest.mark.parametrize("kind", ["steps", "search"])
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_step_of_workers_that_is_broken_off(number, kind):
-    """The answers that nobody has waited for are not taken for those to what is asked next."""
-    env = of_three("fork", fault=number, at=20)
-    watchdog = threading.Timer(60, end, [env])
-    watchdog.start()
-    model = make(kind, env)
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(400)
-    before = env.get_attr("n_steps")
-    n_steps = model.num_timesteps
-    model.learn(90, reset_num_timesteps=False)
-    made = [after - each for after, each in zip(env.get_attr("n_steps"), before, strict=True)]
-    assert made == [(model.num_timesteps - n_steps) // 3] * 3
-    env.close()
-    watchdog.cancel()
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_workers_are_closed_after_a_step_that_is_broken_off():
-    env = of_three("fork", fault="SIGTERM", at=5)
-    watchdog = threading.Timer(60, end, [env])
-    watchdog.start()
-    with pytest.raises(KeyboardInterrupt):
-        make("steps", env).learn(400)
-    env.close()
-    watchdog.cancel()
-    assert [process.exitcode for process in env.processes] == [0, 0, 0]
 
 
 class Once(BaseCallback):
@@ -472,17 +343,16 @@ def test_what_a_wrapper_below_vec_normalize_makes_of_the_numbers(what, at, kind)
     with pytest.raises(ValueError, match=f"{what} of environment 1 is not finite"):
         model.learn(400)
     assert all(np.isfinite(part).all() for part in statistics(env))
-    assert not vars(spoiling).keys() & {"step_wait", "reset"}
     assert model.learn(32, reset_num_timesteps=False).num_timesteps >= 32
 
 
 @all_kinds
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 @pytest.mark.parametrize(
-    ("fault", "value"), [("reward", 1e200), ("reward", -1e60), ("observation", np.full(LENGTH, -1e200))]
+    ("fault", "value"), [("reward", 1e200), ("reward", -1e60), ("observation", np.full(7, -1e200))]
 )
 def test_numbers_beyond_float32_are_not_taken_for_finite_ones(fault, value, wrapper, kind):
-    space = spaces.Box(-INF, INF, (LENGTH,), np.float64)
+    space = spaces.Box(-INF, INF, (7,), np.float64)
     env = wrapper(of_two(fault=fault, at=20, value=value, observation_space=space))
     model = make(kind, env)
     told = rf"{fault} of .*environment 1.* is not finite"
@@ -490,32 +360,8 @@ def test_numbers_beyond_float32_are_not_taken_for_finite_ones(fault, value, wrap
         model.learn(400)
 
 
-@all_kinds
-def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
-    """They can be asked, saved and copied while a model learns, and a copy leads a life of its own."""
-    env = VecNormalize(DummyVecEnv([lambda: Monitor(Faulty())] * 2))
-
-    def act(model):
-        model.save(tmp_path / "model")
-        env.save(tmp_path / "statistics")
-        assert env.env_is_wrapped(Monitor) == [True, True] and env.unwrapped.num_envs == 2
-        before = env.get_attr("n_steps")
-        copy = deepcopy(env.venv)
-        assert type(copy) is DummyVecEnv
-        copy.reset()
-        copy.step(np.zeros(2, int))
-        assert copy.get_attr("n_steps") == [before[0] + 1] * 2 and env.get_attr("n_steps") == before
-        with pytest.raises(AttributeError):
-            env.no_such_attribute  # noqa: B018
-
-    model = make(kind, env).learn(40, callback=Once(act))
-    assert model.num_timesteps >= 40 and type(env.venv) is DummyVecEnv
-    VecNormalize.load(tmp_path / "statistics", of_two())
-    assert KINDS[kind][0].load(tmp_path / "model", env=of_two(), device="cpu").learn(16).num_timesteps >= 16
-
-
 class Copyable(VecEnvWrapper):
-    """As VecNormalize, without what cannot be copied of a wrapper."""
+    """A wrapper without what cannot be copied of one."""
 
     def reset(self):
         return self.venv.reset()
@@ -532,17 +378,73 @@ class Copyable(VecEnvWrapper):
 
 @all_kinds
 @pytest.mark.parametrize("copied", [deepcopy, lambda env: cloudpickle.loads(cloudpickle.dumps(env))])
-def test_a_copy_of_a_wrapper_below_vec_normalize_leads_a_life_of_its_own(copied, kind):
-    env = VecNormalize(Copyable(DummyVecEnv([lambda: Monitor(Faulty())] * 2)))
+@pytest.mark.parametrize("wrapper", [lambda env: env, Copyable])
+def test_a_copy_that_a_callback_makes_leads_a_life_of_its_own(wrapper, copied, kind):
+    """It moves no other environment, and its numbers are nobody's business; trained on, it is guarded."""
+    env = VecNormalize(wrapper(of_two()))
 
     def act(model):
-        before = env.get_attr("n_steps")
-        copy = copied(env.venv)
+        before, copy = env.get_attr("n_steps"), copied(env.venv)
+        assert type(copy) is type(env.venv)
+        single = copy.unwrapped.envs[1]
+        single.fault, single.at, single.value = "reward", single.n_steps + 1, NAN
         copy.reset()
-        copy.step(np.zeros(2, int))
+        assert np.isnan(copy.step(np.zeros(2, int))[1]).tolist() == [False, True]
         assert copy.unwrapped.get_attr("n_steps") == [before[0] + 1] * 2 and env.get_attr("n_steps") == before
+        single.at, single.value = single.n_steps + 1, "x"
+        with pytest.raises(ValueError, match="reward of environment 1 must be a number"):
+            make("steps", copy).learn(8)
 
     assert make(kind, env).learn(40, callback=Once(act)).num_timesteps >= 40
+
+
+@all_kinds
+def test_environments_in_a_callback_are_as_ever(kind, tmp_path):
+    """They can be asked, saved and evaluated beside, and what a user sets on them stays."""
+
+    def stacked():
+        return VecFrameStack(DummyVecEnv([lambda: Monitor(Faulty())] * 2), 2)
+
+    env, calls = VecNormalize(stacked()), []
+    step_wait = env.venv.step_wait
+    evaluation = EvalCallback(VecNormalize(stacked()), n_eval_episodes=1, eval_freq=5, verbose=0)
+
+    def act(model):
+        model.save(tmp_path / "model")
+        env.save(tmp_path / "statistics")
+        assert env.env_is_wrapped(Monitor) == [True, True] and env.unwrapped.num_envs == 2
+        with pytest.raises(AttributeError):
+            env.no_such_attribute  # noqa: B018
+        env.mark = env.venv.mark = env.venv.venv.mark = "the user's"
+        env.venv.step_wait = lambda: calls.append("step") or step_wait()
+
+    model = make(kind, env).learn(40, callback=CallbackList([Once(act), evaluation]))
+    assert model.num_timesteps >= 40 and evaluation.n_calls > 5
+    assert [vars(each)["mark"] for each in (env, env.venv, env.unwrapped)] == ["the user's"] * 3
+    n_calls = len(calls)
+    env.step(np.zeros(2, int))
+    assert n_calls > 1 and len(calls) == n_calls + 1
+    VecNormalize.load(tmp_path / "statistics", stacked())
+    assert KINDS[kind][0].load(tmp_path / "model", env=stacked(), device="cpu").learn(16).num_timesteps >= 16
+
+
+@all_kinds
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt])
+def test_afterwards_the_environments_are_as_before(error, kind):
+    """Also where learning ends with an exception."""
+    env = VecNormalize(VecMonitor(of_two(fault="raise in step" if error else "", at=20, value=error)))
+    stack = [env, env.venv, env.unwrapped]
+    replaced = [vars(each).keys() & dir(VecEnvWrapper) for each in stack]
+    try:
+        make(kind, env).learn(100)
+    except KeyboardInterrupt:
+        assert error
+    assert [env, env.venv, env.unwrapped] == stack
+    assert [vars(each).keys() & dir(VecEnvWrapper) for each in stack] == replaced
+    env.reset()
+    env.unwrapped.envs[0].fault, env.unwrapped.envs[0].value = "reward", NAN
+    env.unwrapped.envs[0].at = env.unwrapped.envs[0].n_steps + 1
+    env.step(np.zeros(2, int))
 
 
 @all_kinds
@@ -551,10 +453,7 @@ def test_learning_within_a_callback(fault, kind):
     """What another model has done with the same environments leaves them guarded."""
     env = VecNormalize(of_two(fault=fault, at=40, value=NAN if fault == "reward" else np.zeros(1)))
     other = make("steps", env)
-    bases = []
-    look = Once(lambda model: bases.append(env.venv.venv))
     with pytest.raises(ValueError, match=f"The {fault} of environment 1"):
-        make(kind, env).learn(400, callback=Once(lambda model: other.learn(24, callback=look)))
-    assert len(bases) == 1 and type(bases[0]) is DummyVecEnv
-    assert other.num_timesteps == 32 and type(env.venv) is DummyVecEnv and "_save_obs" not in vars(env.venv)
+        make(kind, env).learn(400, callback=Once(lambda model: other.learn(24)))
+    assert other.num_timesteps == 32
     assert all(np.isfinite(part).all() for part in statistics(env))

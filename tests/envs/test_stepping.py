@@ -1,4 +1,4 @@
-"""A DummyVecEnv stepped without its copies returns what its own ``step`` returns."""
+"""While a model learns, a DummyVecEnv returns what its own ``step`` returns, without its deep copies."""
 
 from copy import deepcopy
 from typing import Any
@@ -7,10 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from models import KINDS
+from models import make as make_model
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_reinforce.envs.stepping import step_in_turn, stepper
+from sb3_reinforce.envs.guards import guard
 
 SPACES = {
     "box": spaces.Box(-1, 1, (2, 3)),
@@ -69,9 +70,11 @@ def assert_same(ours: Any, theirs: Any) -> None:
 @pytest.mark.parametrize("space", SPACES)
 def test_it_returns_what_step_returns(space: str) -> None:
     ours, theirs = make(space), make(space)
-    assert_same(ours.reset(), theirs.reset())
+    with guard(ours):
+        assert_same(ours.reset(), theirs.reset())
     for action in np.random.default_rng(0).normal(size=(50, 3, 2)):
-        obs, rewards, dones, infos = step_in_turn(ours, action)
+        with guard(ours):
+            obs, rewards, dones, infos = ours.step(action)
         their_obs, their_rewards, their_dones, their_infos = theirs.step(action)
         for mine, other in ((obs, their_obs), (rewards, their_rewards), (dones, their_dones)):
             assert_same(mine, other)
@@ -92,7 +95,8 @@ def test_what_was_returned_stays_as_it_was() -> None:
     separate.reset(), one.reset()
     returned = []
     for action in np.random.default_rng(0).normal(size=(50, 3, 2)):
-        returned.append((separate.step(action), step_in_turn(one, action)))
+        with guard(one):
+            returned.append((separate.step(action), one.step(action)))
     n_ended = 0
     for (obs, rewards, dones, infos), ours in returned:
         for mine, other in zip(ours[:3], (obs, rewards, dones), strict=True):
@@ -103,17 +107,20 @@ def test_what_was_returned_stays_as_it_was() -> None:
     assert n_ended > 50
 
 
-@pytest.mark.parametrize("method", ["step", "step_async", "step_wait"])
-def test_a_replaced_method_is_called(method: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("method", ["step", "step_async", "step_wait", "reset"])
+def test_methods_of_the_users_own_are_called(method: str, kind: str) -> None:
+    """Of a subclass, or put in the place of those of one VecEnv."""
+    calls = []
+
+    def own(self: DummyVecEnv, *args: Any) -> Any:
+        calls.append(method)
+        return getattr(DummyVecEnv, method)(self, *args)
+
+    subclass = type("Own", (DummyVecEnv,), {method: own})
+    make_model(kind, subclass([lambda: Drawn(SPACES["box"])])).learn(8)
+    n_calls = len(calls)
     env = make("box")
-    setattr(env, method, lambda *args: None)
-    assert stepper(env) == env.step
-
-
-def test_only_a_plain_dummy_vec_env_is_stepped_so() -> None:
-    class Own(DummyVecEnv):
-        pass
-
-    assert stepper(make("box")).func is step_in_turn  # type: ignore[attr-defined]
-    for env in (VecNormalize(make("box")), make_vec_env("CartPole-v1", 2, vec_env_cls=Own)):
-        assert stepper(env) == env.step
+    setattr(env, method, lambda *args: own(env, *args))
+    make_model(kind, env).learn(8)
+    assert 0 < n_calls < len(calls) and method in vars(env)

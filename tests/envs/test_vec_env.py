@@ -12,6 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.diagnostics import landscape
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 N_ENVS = 3
@@ -283,10 +284,19 @@ def test_forms_that_stand_for_observations_are_taken(form, monkeypatch):
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
 def test_episodes_that_gymnasium_records(mode):
-    vector_env = SyncVectorEnv([lambda: Corridor((4,))] * N_ENVS, autoreset_mode=mode)
-    model = REINFORCE("MlpPolicy", GymnasiumVecEnv(RecordEpisodeStatistics(vector_env)), n_steps=8, device="cpu")
-    model.learn(8 * N_ENVS)
-    assert [info["l"] for info in model.ep_info_buffer] == [4] * (2 * N_ENVS)
+    """Also where one ends while another goes on."""
+    vector_env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode)
+    env = GymnasiumVecEnv(RecordEpisodeStatistics(vector_env))
+    env.seed(0)
+    env.reset()
+    lengths, recorded = np.zeros(N_ENVS, dtype=int), []
+    for _ in range(60):
+        _, _, dones, infos = env.step(np.zeros(N_ENVS, int))
+        lengths += 1
+        recorded += [(infos[i]["episode"]["l"], infos[i]["episode"]["r"], lengths[i]) for i in np.flatnonzero(dones)]
+        lengths[dones] = 0
+    assert len(recorded) > 30 and all(length == reward == steps for length, reward, steps in recorded)
+    assert len(REINFORCE("MlpPolicy", env, n_steps=8, device="cpu").learn(24).ep_info_buffer) >= 3
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
@@ -306,6 +316,23 @@ def test_the_infos_of_a_reset_are_those_of_the_last_one(mode):
     for _ in range(4):
         env.step(np.zeros(N_ENVS, int))
     assert [info["n"] for info in env.reset_infos] == [2] * N_ENVS
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_copies_in_other_processes_start_from_the_same_seeds(mode):
+    """Which a search compares its candidates by."""
+
+    def env_fn():
+        return Corridor((2, 3, 5), reward=lambda t, action: t + 10.0 * action)
+
+    thetas, utilities = [], []
+    for vector_env in (SyncVectorEnv, AsyncVectorEnv):
+        env = GymnasiumVecEnv(vector_env([env_fn] * N_ENVS, autoreset_mode=mode))
+        model = FiniteDifference("LinearPolicy", env, n_delta=11, seed=0).learn(60)
+        thetas.append(model.theta)
+        utilities.append(landscape(model, n_points=3, n_episodes=2).utilities)
+        env.close()
+    assert thetas[0].equal(thetas[1]) and np.array_equal(*utilities)
 
 
 def test_methods_of_copies_in_other_processes():

@@ -22,6 +22,7 @@ def make_rollout(returns, dones, timesteps, used=None, policy=None):
         discounts=th.ones_like(returns),
         values=None,
         policy=policy,
+        denominator=n_steps * n_envs,
     )
 
 

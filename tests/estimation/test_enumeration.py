@@ -17,17 +17,15 @@ from enumeration import (
     episode_terms,
     expectation,
     expected_gradient,
-    fill,
     gradient_of_return,
     log_pi,
     make_model,
+    rollout_of,
     true_gradient,
 )
 from environments import Tree
 
 from sb3_reinforce.estimation.baselines import score_products
-from sb3_reinforce.estimation.rollout import Extent
-from sb3_reinforce.estimation.weights import Running, weigh
 
 
 @pytest.mark.parametrize("ragged", [False, True])
@@ -108,10 +106,7 @@ def test_dividing_by_steps_only_rescales_where_lengths_are_equal():
 def test_optimal_is_its_formula_on_the_other_episodes(reward_to_go):
     model = make_model(ragged=True, baseline="optimal", reward_to_go=reward_to_go, n_episodes=3)
     for batch in product(Tree(ragged=True).trajectories(), repeat=3):
-        buffer, ends = fill(model, batch)
-        extent = Extent.whole_episodes(3, 3, 1000)
-        rollout = weigh(model.policy, buffer, ends, buffer.observations[-1], extent, Running.none(3), model._weighing)
-        ours = model._weighing.baseline(rollout)
+        _, ours = rollout_of(model, batch)
         terms = [episode_terms(trajectory, reward_to_go) for trajectory in batch]
         for i in range(3):
             others = [terms[j] for j in range(3) if j != i]

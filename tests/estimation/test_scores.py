@@ -1,4 +1,4 @@
-"""The gradients of all episodes at once are those of one backward pass each, whatever the policy and the memory."""
+"""The gradients of all episodes are those of one backward pass each, whatever the policy and the memory."""
 
 from dataclasses import replace
 
@@ -9,11 +9,10 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
-from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation import scores
-from sb3_reinforce.estimation.scores import PIECE, episode_gradients, gradients_by_episode
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.estimation import gradients_by_episode
 
 ACTION_SPACES = [
     spaces.Discrete(3),
@@ -25,14 +24,31 @@ ACTION_SPACES = [
 
 def collect(env, policy="MlpPolicy", n_episodes=5, **kwargs):
     model = REINFORCE(policy, env, baseline="none", n_episodes=n_episodes, learning_rate=0.0, device="cpu", **kwargs)
-    return model.learn(1)._rollout
+    return model.learn(1).rollout
+
+
+def one_by_one(rollout, *weights):
+    """One backward pass through the policy's own method for each episode and weight."""
+    policy = rollout.policy
+    parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    found = []
+    for episode in th.unique(rollout.episodes[rollout.used]):
+        steps = rollout.used & (rollout.episodes == episode)
+        obs = rollout.observations
+        obs = {key: part[steps] for key, part in obs.items()} if isinstance(obs, dict) else obs[steps]
+        actions = as_policy_actions(rollout.actions[steps], policy.action_space)
+        _, log_prob, _ = policy.evaluate_actions(obs, actions)
+        for w in weights:
+            gradients = th.autograd.grad((w[steps] * log_prob).sum(), parameters, retain_graph=True, allow_unused=True)
+            found.append(th.cat([gradient.flatten() for gradient in gradients if gradient is not None]))
+    return th.stack(found).unflatten(0, (-1, len(weights))).transpose(0, 1)
 
 
 def assert_as_one_by_one(rollout, **kwargs):
     weights = rollout.returns, th.randn(rollout.returns.shape)
     before = list(rollout.policy.named_parameters(remove_duplicate=False))
     together = gradients_by_episode(rollout, *weights, **kwargs)
-    alone = th.stack([th.stack(gradients) for gradients in episode_gradients(rollout, *weights)], dim=1)
+    alone = one_by_one(rollout, *weights)
     assert alone.abs().max() > 0
     after = rollout.policy.named_parameters(remove_duplicate=False)
     assert all(old is new for (_, old), (_, new) in zip(before, after, strict=True)), "the policy is as it was"
@@ -44,8 +60,8 @@ def assert_as_one_by_one(rollout, **kwargs):
 @pytest.mark.parametrize("action_space", ACTION_SPACES)
 @pytest.mark.parametrize("chunk", [1, 2**25])
 def test_every_action_space_and_any_memory(action_space, chunk):
-    """Episodes shorter and longer than a piece, in environments that go on after their quota."""
-    env = make_vec_env(lambda: Corridor((1, 7, 2 * PIECE + 3), action_space=action_space), 2, seed=0)
+    """Short and long episodes, in environments that go on after their quota."""
+    env = make_vec_env(lambda: Corridor((1, 7, 259), action_space=action_space), 2, seed=0)
     assert_as_one_by_one(collect(env), chunk=chunk)
 
 
@@ -68,32 +84,15 @@ def test_dict_observations():
 
 
 class Branching(ActorCriticPolicy):
-    """Looks at its data, which vmap cannot trace."""
+    """Its log π depends on all observations of a batch."""
 
     def evaluate_actions(self, obs, actions):
         values, log_prob, entropy = super().evaluate_actions(obs, actions)
         return values, log_prob * (2.0 if float(obs.sum()) > 0 else 1.0), entropy
 
 
-def test_a_policy_that_cannot_be_traced_is_taken_one_by_one():
+def test_a_policy_with_a_method_that_branches():
     assert_as_one_by_one(collect(Corridor((2, 9)), Branching))
-
-
-class OutOfMemory(ActorCriticPolicy):
-    """Has memory for a few steps at a time."""
-
-    def evaluate_actions(self, obs, actions):
-        if len(obs) > 4:
-            raise th.OutOfMemoryError("no memory for so many steps")
-        return super().evaluate_actions(obs, actions)
-
-
-def test_an_error_of_the_policy_is_not_taken_for_one_that_cannot_be_traced(monkeypatch):
-    rollout = collect(Corridor((7, 9)))
-    rollout = replace(rollout, policy=REINFORCE(OutOfMemory, Corridor((7, 9)), device="cpu").policy)
-    monkeypatch.setattr(scores, "episode_gradients", None)
-    with pytest.raises(th.OutOfMemoryError, match="no memory"):
-        gradients_by_episode(rollout, rollout.returns)
 
 
 class Detached(ActorCriticPolicy):
@@ -109,20 +108,6 @@ def test_a_policy_without_a_gradient_is_named():
     detached = REINFORCE(Detached, Corridor((2, 9)), device="cpu").policy
     with pytest.raises(ValueError, match=r"Detached cannot be differentiated"):
         gradients_by_episode(replace(rollout, policy=detached), rollout.returns)
-
-
-def test_five_weights_cost_less_than_three_plain_passes():
-    """A plain pass is a forward, a backward and the gradients, of as many products each; only the last are repeated."""
-    rollout = collect(make_vec_env("CartPole-v1", 4, seed=0), n_episodes=8)
-
-    def products(function):
-        with FlopCounterMode(display=False) as counter:
-            function()
-        return counter.get_total_flops()
-
-    plain = products(lambda: list(episode_gradients(rollout, rollout.returns)))
-    weights = [th.randn(rollout.returns.shape) for _ in range(5)]
-    assert 2 * plain < products(lambda: gradients_by_episode(rollout, *weights)) < 3 * plain
 
 
 @pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "action_net.bias", "log_std"])
@@ -142,10 +127,9 @@ def test_layers_that_share_a_parameter():
     assert_as_one_by_one(rollout)
 
 
-@pytest.mark.parametrize("use_sde", [False, True])
-def test_memory_beside_the_result_is_bounded(use_sde):
-    """The widest intermediate has ``chunk`` floats and not those of all pieces."""
-    rollout, widest = collect("Pendulum-v1", n_episodes=2, use_sde=use_sde), []
+def test_memory_beside_the_result_is_bounded():
+    """The widest intermediate has ``chunk`` floats, or as many as the result."""
+    rollout, widest = collect("Pendulum-v1", n_episodes=2), []
 
     class Watch(th.utils._python_dispatch.TorchDispatchMode):
         def __torch_dispatch__(self, function, types, args=(), kwargs=None):

@@ -10,9 +10,9 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.critic import fit_critic, values_of
-from sb3_reinforce.policies.evaluation import evaluate
-from sb3_reinforce.policies.plain_mlp import critic_layers
+from sb3_reinforce.policies.critic import fit_critic, values_along
+from sb3_reinforce.policies.evaluation import evaluate, route_of
+from sb3_reinforce.policies.plain_mlp import plain_critic
 
 N_STEPS, N_ENVS = 7, 3
 
@@ -50,11 +50,11 @@ def observations(buffer):
     [("MlpPolicy", {}), ("MlpPolicy", {"activation_fn": th.nn.ReLU}), ("CnnPolicy", {}), (OwnCnnCritic, {})],
 )
 def test_values_are_the_policys(policy, kwargs):
-    """Laid out, told along with the actions, or asked for in one batch."""
+    """From plain layers, along with the actions, or in one batch."""
     model = make(policy, learning_rate=0.0, policy_kwargs=kwargs).learn(1)
     with th.no_grad():
         expected = model.policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
-    values = values_of(model.policy, model.rollout_buffer)
+    values = values_along(model.policy, route_of(model.policy, True), model.rollout_buffer)
     np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-6)
     assert np.std(values) > 1e-3
 
@@ -72,7 +72,9 @@ def test_a_kept_features_extractor_gives_the_same_critic(policy, share):
         names = ["value_net", "mlp_extractor.value_net", *([] if share else ["vf_features_extractor"])]
         critic = [parameter for name in names for parameter in model.policy.get_submodule(name).parameters()]
         th.manual_seed(1)
-        fit_critic(model.policy, th.optim.SGD(critic, 1e-3), critic, obs, returns, 3, 5, None)
+        fit_critic(
+            model.policy, route_of(model.policy, True), th.optim.SGD(critic, 1e-3), critic, obs, returns, 3, 5, None
+        )
         fitted.append(critic)
     for mine, other in zip(*fitted, strict=True):
         th.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
@@ -131,8 +133,10 @@ def test_a_critic_that_the_user_has_changed_is_asked_itself(name):
     policy, model = changed(name), make("MlpPolicy").learn(1)
     with th.no_grad():
         expected = policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
-    np.testing.assert_allclose(values_of(policy, model.rollout_buffer), expected, rtol=1e-5, atol=1e-6)
-    assert (critic_layers(policy) is not None) == (name == "as it is")
+    np.testing.assert_allclose(
+        values_along(policy, route_of(policy, True), model.rollout_buffer), expected, rtol=1e-5, atol=1e-6
+    )
+    assert (plain_critic(policy) is not None) == (name in ("as it is", "tied"))
 
 
 def test_a_hook_on_a_parameter_of_the_critic_is_called():
@@ -169,4 +173,6 @@ def test_values_of_the_policy_step_are_those_of_predict_values(policy):
     own = type("Own", (OWN[policy],), {"predict_values": lambda self, obs: th.full((len(obs), 1), 3.0)})
     model = make(own).learn(1)
     obs = observations(model.rollout_buffer)
-    assert (evaluate(model.policy, obs, th.zeros(len(obs)), with_values=True)[2] == 3).all()
+    assert (
+        evaluate(model.policy, route_of(model.policy, True), obs, th.zeros(len(obs)), with_values=True)[2] == 3
+    ).all()

@@ -1,19 +1,22 @@
-"""The laid-out actor is the policy: the same function of the observation, and the same distribution of actions."""
+"""The NumPy actor is the policy: the same function of the observation, the same actions for the same seed."""
 
 import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.plain_mlp import actor_layers
-from sb3_reinforce.sampling.actors import GeneralActor, LaidOutActor, make_actor, make_noise, make_sampler
+from sb3_reinforce.policies.evaluation import route_of
+from sb3_reinforce.policies.plain_mlp import plain_actor
+from sb3_reinforce.sampling.actors import NumpyActor, PolicyActor, make_actor
 
 SPACES = [spaces.Discrete(4), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2, 1))]
 N_DRAWS = 4000
@@ -29,60 +32,46 @@ def make_policy(space=SPACES[0], policy="MlpPolicy", **kwargs):
     return model.policy
 
 
-@pytest.mark.parametrize("space", SPACES, ids=str)
-@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
-def test_without_noise_it_is_the_mode(space, activation_fn, monkeypatch):
-    policy = make_policy(space, policy_kwargs={"activation_fn": activation_fn})
-    obs = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
-    zeros = iter([np.zeros((50, policy.action_net.out_features), dtype=np.float32)])
-    monkeypatch.setattr("sb3_reinforce.sampling.actors.make_noise", lambda *args: zeros)
-    actions, _, _ = LaidOutActor(policy, actor_layers(policy), 50).act(obs)
-    with th.no_grad():
-        mode = policy.get_distribution(obs_as_tensor(obs, "cpu")).mode().numpy()
-    np.testing.assert_allclose(actions, mode.reshape(50, *space.shape), rtol=1e-5, atol=1e-6)
-    assert actions.dtype == mode.dtype
-
-
-@pytest.mark.parametrize("actor", ["laid out", "general"])
-@pytest.mark.parametrize("space", SPACES, ids=str)
-def test_actions_are_drawn_from_the_policys_distribution(space, actor):
-    """The mean score of the draws is 0 to within its standard error: for no other distribution is E[∇ log π] = 0."""
-    policy = make_policy(space)
-    obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
-    act = (
-        LaidOutActor(policy, actor_layers(policy), N_DRAWS) if actor == "laid out" else GeneralActor(policy, False)
-    ).act
-    actions = th.as_tensor(act(obs)[0]).reshape(N_DRAWS, -1).float()
-    actions = actions.flatten() if isinstance(space, spaces.Discrete) else actions
-    distribution = policy.get_distribution(obs_as_tensor(obs[:1], "cpu"))
-    parameters = [policy.action_net.bias, *([policy.log_std] if hasattr(policy, "log_std") else [])]
-    scores = th.stack([
-        th.cat(th.autograd.grad(distribution.log_prob(action[None]).sum(), parameters, retain_graph=True))
-        for action in actions
-    ])  # fmt: skip
-    assert (scores.mean(0).abs() < 4 * scores.std(0) / N_DRAWS**0.5).all()
-    assert (scores.std(0) > 0).all()
+def actor_of(policy, n_envs):
+    return make_actor(policy, route_of(policy), n_envs)
 
 
 @pytest.mark.parametrize(("space", "kwargs"), [*((space, {}) for space in SPACES), (SPACES[0], {"temperature": 0.3})])
-def test_both_give_the_same_log_probabilities(space, kwargs):
-    policy = make_policy(space, **kwargs)
-    obs = np.random.default_rng(0).normal(size=(6, 3, 5)).astype(np.float32)
-    laid_out, general = LaidOutActor(policy, actor_layers(policy), 3), GeneralActor(policy, False)
-    actions = np.stack([laid_out.act(row)[0].reshape(3, -1) for row in obs])
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
+@pytest.mark.parametrize("n_envs", [1, 3, 40])
+def test_the_same_seed_gives_the_same_actions(space, kwargs, activation_fn, n_envs):
+    """As the policy's own methods, which draw their noise in Stable-Baselines3 and PyTorch."""
+    policy = make_policy(space, policy_kwargs={"activation_fn": activation_fn}, **kwargs)
+    obs = np.random.default_rng(0).normal(size=(20, n_envs, 5)).astype(np.float32)
+    actions = []
+    fast = actor_of(policy, n_envs)
+    general = PolicyActor(policy, route_of(policy))
+    assert isinstance(fast, NumpyActor)
+    for actor in (fast, general):
+        th.manual_seed(1)
+        actions.append(np.stack([actor.act(row)[0] for row in obs]))
+    np.testing.assert_allclose(*actions, rtol=1e-4, atol=1e-5)
+    assert actions[0].dtype == actions[1].dtype and np.ptp(actions[0]) > 0
+    stored = actions[0].reshape(20, n_envs, -1)
     # Where log π is near 0, what is left is the rounding of logits of order 1
-    np.testing.assert_allclose(laid_out.log_prob(obs, actions), general.log_prob(obs, actions), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(fast.log_prob(obs, stored), general.log_prob(obs, stored), rtol=1e-4, atol=1e-5)
 
 
-def test_noise_is_that_of_its_distribution():
-    """Draws of the sampler from given logits, against the probabilities of the softmax."""
-    policy = make_policy(spaces.Discrete(3))
-    noise, sample = make_noise(policy, 10_000), make_sampler(policy)
-    logits = th.tensor([1.0, -0.5, 0.2])
-    actions = sample(np.tile(logits.numpy(), (10_000, 1)), next(noise))
-    shares = np.bincount(actions, minlength=3) / 10_000
-    np.testing.assert_allclose(shares, logits.softmax(0), atol=4 * 0.5 / 100)
-    assert not np.array_equal(next(noise), next(noise))
+class OwnForward(ActorCriticPolicy):
+    """Plain, but by a method of its own, so that nothing is replaced."""
+
+    def forward(self, obs, deterministic=False):
+        return super().forward(obs, deterministic)
+
+
+@pytest.mark.parametrize("space", SPACES, ids=str)
+def test_a_run_does_not_depend_on_the_path(space):
+    ends = []
+    for policy in ("MlpPolicy", OwnForward):
+        env = make_vec_env(lambda: Corridor((3, 5), lambda t, action: float(np.sum(action)), space), 3, seed=0)
+        model = REINFORCE(policy, env, seed=0, device="cpu", n_steps=8, learning_rate=1e-2).learn(200)
+        ends.append(th.nn.utils.parameters_to_vector(model.policy.parameters()))
+    th.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
 
 
 def scale(module, factor=-20):
@@ -152,6 +141,11 @@ def own_method(policy):
     policy._get_action_dist_from_latent = lambda latent: method(latent * -20)
 
 
+def own_distribution(policy):
+    proba_distribution = policy.action_dist.proba_distribution
+    policy.action_dist.proba_distribution = lambda action_logits: proba_distribution(action_logits * -20)
+
+
 CHANGES = {
     "as it is": lambda policy: None,
     "class": lambda policy: setattr(policy, "__class__", OwnLatent),
@@ -169,6 +163,12 @@ CHANGES = {
     "body": own_body,
     "layer": own_layer,
     "forward": own_forward,
+    "hook on the flatten": lambda policy: scale(policy.features_extractor.flatten),
+    "hook on the policy": lambda policy: policy.register_forward_hook(lambda module, inputs, output: output),
+    "forward of the mlp extractor": lambda policy: setattr(
+        policy.mlp_extractor, "forward_actor", lambda features: policy.mlp_extractor.policy_net(features) * -20
+    ),
+    "distribution of the instance": own_distribution,
     "no bias": lambda policy: setattr(policy.action_net, "bias", None),
     "gelu": lambda policy: policy.mlp_extractor.policy_net.append(th.nn.GELU()),
 }
@@ -186,18 +186,23 @@ def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
 
     before = probability()
     CHANGES[change](policy)
-    actor, expected = make_actor(policy, N_DRAWS, False), probability()
+    actor, expected = actor_of(policy, N_DRAWS), probability()
     share = actor.act(obs)[0].mean()
     assert share == pytest.approx(expected, abs=4 * 0.5 / N_DRAWS**0.5)
-    assert isinstance(actor, LaidOutActor) == (change == "as it is") and abs(before - expected) < 1
-    assert change in ("as it is", "no bias", "gelu") or abs(before - expected) > 0.2
+    assert isinstance(actor, NumpyActor) == (change == "as it is") and abs(before - expected) < 1
+    assert change in ("as it is", "no bias", "gelu", "hook on the policy") or abs(before - expected) > 0.2
+
+
+def is_fast(policy):
+    return isinstance(actor_of(policy, 2), NumpyActor)
 
 
 def test_whatever_is_not_plain_goes_the_general_way():
-    assert actor_layers(make_policy(policy_kwargs={"activation_fn": th.nn.ELU})) is None
-    assert actor_layers(make_policy(SPACES[3], use_sde=True)) is None
-    assert actor_layers(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
-    assert actor_layers(th.compile(make_policy(), backend="eager")) is None
+    assert is_fast(make_policy())
+    assert not is_fast(make_policy(policy_kwargs={"activation_fn": th.nn.ELU}))
+    assert plain_actor(make_policy(SPACES[3], use_sde=True)) is None
+    assert plain_actor(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
+    assert plain_actor(th.compile(make_policy(), backend="eager")) is None
 
 
 @pytest.mark.parametrize("name", ["mlp_extractor.policy_net.2", "action_net"])
@@ -213,21 +218,87 @@ def test_backward_hooks_are_called(name, hook):
 def test_images_go_the_general_way():
     """They are scaled to [0, 1] before they are flattened."""
     model = REINFORCE("MlpPolicy", FakeImageEnv(screen_height=36, screen_width=36), device="cpu")
-    assert type(model.policy.features_extractor) is FlattenExtractor and actor_layers(model.policy) is None
+    assert type(model.policy.features_extractor) is FlattenExtractor and not is_fast(model.policy)
 
 
 def test_a_squashed_gaussian_is_squashed():
     policy = make_policy(spaces.Box(-1, 1, (2,)))
     policy.action_dist = SquashedDiagGaussianDistribution(2)
-    actions = make_actor(policy, 3, False).act(10 * np.ones((3, 5), dtype=np.float32))[0]
+    actions = actor_of(policy, 3).act(10 * np.ones((3, 5), dtype=np.float32))[0]
     assert np.abs(actions).max() < 1
 
 
 def test_each_rollout_acts_with_the_parameters_of_the_last_update():
-    """A laid-out actor that were not refreshed would go on as it began."""
     model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=20, learning_rate=0.0, seed=0)
     model.learn(20)
     with th.no_grad():
         model.policy.action_net.bias.copy_(th.tensor([-100.0, 100.0]))
     model.learn(20)
     assert (model.rollout_buffer.actions == 1).all()
+
+
+@pytest.mark.parametrize("module", ["", "mlp_extractor", "features_extractor.flatten"])
+def test_forward_hooks_are_called_as_in_a2c(module):
+    model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
+    model.policy.get_submodule(module).register_forward_hook(lambda *args: calls.append(1))
+    model.learn(8)
+    assert len(calls) >= 8
+
+
+class Change(BaseCallback):
+    """Changes the policy so that it only takes action 1, after the tenth step."""
+
+    def __init__(self, how):
+        super().__init__()
+        self.how = how
+
+    def _on_step(self):
+        if self.n_calls == 10:
+            self.how(self.model)
+        return True
+
+
+def prefer(policy):
+    with th.no_grad():
+        policy.action_net.bias.copy_(th.tensor([-100.0, 100.0]))
+
+
+def new_policy(model):
+    model.policy = type(model.policy)(model.observation_space, model.action_space, model.lr_schedule)
+    prefer(model.policy)
+
+
+def new_layer(model):
+    model.policy.action_net = th.nn.Linear(64, 2)
+    prefer(model.policy)
+
+
+def new_memory(model):
+    model.policy.action_net.bias.data = th.tensor([-100.0, 100.0])
+
+
+def new_parameter(model):
+    model.policy.action_net.bias = th.nn.Parameter(th.tensor([-100.0, 100.0]))
+
+
+def new_hook(model):
+    model.policy.action_net.register_forward_hook(lambda module, inputs, logits: logits + th.tensor([-100.0, 100.0]))
+
+
+def new_method(model):
+    layer = model.policy.action_net
+    layer.forward = lambda x: type(layer).forward(layer, x) + th.tensor([-100.0, 100.0])
+
+
+HOWS = [lambda model: prefer(model.policy), new_policy, new_layer, new_memory, new_parameter, new_hook, new_method]
+
+
+@pytest.mark.parametrize("how", HOWS, ids=lambda how: how.__name__)
+def test_a_policy_that_a_callback_changes_acts_differently_at_once(how):
+    """As with A2C, not only from the next rollout on."""
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=40, learning_rate=0.0, seed=0, device="cpu")
+    model.learn(40, callback=Change(how))
+    actions = model.rollout_buffer.actions.ravel()
+    assert 0 in actions[:10] and (actions[10:] == 1).all()
+    log_probs = model.rollout_buffer.log_probs.ravel()
+    assert (log_probs[:10] < -0.1).all() and np.allclose(log_probs[10:], 0, atol=1e-6)

@@ -1,6 +1,7 @@
 """Candidates side by side: the same as one by one, from the starts that they should have, and none of them twice."""
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -14,12 +15,19 @@ from stable_baselines3.common.policies import (
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.evaluation import set_temperature
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, VmapActor, actor_class, make_actor, mode
-from sb3_reinforce.sampling.candidates import Step, evaluate, queues, start
+from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor, mode
+from sb3_reinforce.sampling.candidates import (
+    CandidateStep,
+    evaluate_candidates,
+    schedule_episodes,
+    start_episodes,
+)
 
 BOX = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
@@ -38,16 +46,29 @@ class OwnPrediction(ActorCriticPolicy):
         return super()._predict(observation, deterministic)
 
 
+class OwnExtractor(FlattenExtractor):
+    """Known under three names in a policy that shares it."""
+
+    def __init__(self, space: spaces.Space) -> None:
+        super().__init__(space)
+        self.scale = th.nn.Parameter(th.ones(self.features_dim))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.scale * super().forward(observations)
+
+
 POLICIES = [
     (LinearPolicy, BOX, {}, MatrixActor),
     (ActorCriticPolicy, BOX, {}, MatrixActor),
-    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), VmapActor),
+    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.GELU), MatrixActor),
+    (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), LoopActor),
+    (ActorCriticPolicy, BOX, dict(activation_fn=lambda: th.nn.Softmax(dim=1)), LoopActor),
+    (ActorCriticPolicy, BOX, dict(features_extractor_class=OwnExtractor), LoopActor),
     (ActorCriticPolicy, spaces.Discrete(5), {}, MatrixActor),
     (ActorCriticPolicy, spaces.Box(-1, 1, (2, 3)), dict(share_features_extractor=False), MatrixActor),
-    (ActorCriticCnnPolicy, IMAGE, {}, VmapActor),
-    (ActorCriticCnnPolicy, IMAGE, dict(share_features_extractor=False, net_arch=[5]), VmapActor),
+    (ActorCriticCnnPolicy, IMAGE, {}, LoopActor),
     (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": spaces.Discrete(2)}), {}, MatrixActor),
-    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": IMAGE}), {}, VmapActor),
+    (MultiInputActorCriticPolicy, spaces.Dict({"a": BOX, "b": IMAGE}), {}, LoopActor),
     (OwnPrediction, BOX, {}, LoopActor),
     (ActorCriticPolicy, BOX, dict(use_sde=True, squash_output=True), LoopActor),
 ]
@@ -72,6 +93,23 @@ def perturbed(policy: ActorCriticPolicy, k: int, scale: float = 0.3) -> tuple[li
     return actor, theta + scale * th.randn(k, len(theta), dtype=th.float64, generator=generator)
 
 
+def check_side_by_side_is_one_by_one(policy: ActorCriticPolicy, expected: type | None = None) -> None:
+    actor, thetas = perturbed(policy, K)
+    obs, before = sample(policy.observation_space, K), {name: p.clone() for name, p in policy.state_dict().items()}
+    together = make_candidate_actor(policy, actor, K, deterministic=True)
+    assert expected is None or type(together) is expected
+    # In two parts, and the first part twice, as environments are refilled
+    together.assign([0, 2], thetas[[1, 2]])
+    together.assign([0, 1, 3], thetas[[0, 1, 3]])
+    batched = together.act(obs)
+    assert all(th.equal(value, before[name]) for name, value in policy.state_dict().items())
+    for i in range(K):
+        parameters.write(actor, thetas[i])
+        alone, _ = policy.predict(take(obs, i), deterministic=True)
+        np.testing.assert_allclose(batched[i], alone + getattr(policy.action_space, "start", 0), rtol=1e-4, atol=1e-5)
+        assert policy.action_space.contains(batched[i].astype(policy.action_space.dtype))
+
+
 @pytest.mark.parametrize("actions", ACTIONS, ids=str)
 @pytest.mark.parametrize(("policy_class", "obs_space", "kwargs", "expected"), POLICIES)
 def test_side_by_side_is_one_by_one(
@@ -84,22 +122,51 @@ def test_side_by_side_is_one_by_one(
     if kwargs.get("use_sde") and not isinstance(actions, spaces.Box):
         pytest.skip("gSDE is for Box actions")
     th.manual_seed(0)
-    policy = policy_class(obs_space, actions, lambda _: 1e-3, **kwargs)
-    assert actor_class(policy) is expected
+    check_side_by_side_is_one_by_one(policy_class(obs_space, actions, lambda _: 1e-3, **kwargs), expected)
+
+
+def shift(*inputs: Any) -> th.Tensor:
+    """A forward hook."""
+    return inputs[-1] + th.arange(inputs[-1].shape[-1])
+
+
+def replace(thing: Any, name: str, change: Callable[[th.Tensor], th.Tensor]) -> None:
+    """Put a function that refers to the old method in its place."""
+    old = getattr(thing, name)
+    setattr(thing, name, lambda *args, **kwargs: old(change(*args[:1], *kwargs.values()), *args[1:]))
+
+
+# What a user may do to a policy to change how it acts
+CHANGES: dict[str, Callable[[ActorCriticPolicy], Any]] = {
+    "hook on flatten": lambda policy: policy.features_extractor.flatten.register_forward_hook(shift),
+    "hook on the extractor": lambda policy: policy.features_extractor.register_forward_hook(shift),
+    "hook on a layer": lambda policy: policy.mlp_extractor.policy_net[0].register_forward_hook(shift),
+    "hook before a layer": lambda policy: policy.action_net.register_forward_pre_hook(lambda layer, x: (2 * x[0],)),
+    "forward_actor": lambda policy: replace(policy.mlp_extractor, "forward_actor", lambda x: x * x),
+    "proba_distribution": lambda policy: replace(policy.action_dist, "proba_distribution", shift),
+    "extract_features": lambda policy: replace(policy, "extract_features", lambda x: -x),
+    "forward of a layer": lambda policy: replace(policy.action_net, "forward", lambda x: -x),
+    "temperature": lambda policy: set_temperature(policy, 0.1),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_a_user_changes_in_a_policy_changes_its_candidates(change: str) -> None:
+    th.manual_seed(0)
+    policy = ActorCriticPolicy(BOX, spaces.Discrete(7), lambda _: 1e-3, net_arch=[16])
+    CHANGES[change](policy)
+    check_side_by_side_is_one_by_one(policy)
+
+
+def test_an_error_in_prediction_leaves_the_policy_as_it_was() -> None:
+    policy = OwnPrediction(BOX, spaces.Discrete(3), lambda _: 1e-3)
     actor, thetas = perturbed(policy, K)
-    obs, before = sample(obs_space, K), parameters.read(actor)
-    together = make_actor(policy, actor, K, deterministic=True)
-    # In two parts, and the first part twice, as environments are refilled
-    together.assign([0, 2], thetas[[1, 2]])
-    together.assign([0, 1, 3], thetas[[0, 1, 3]])
-    batched = together.act(obs)
+    before = parameters.read(actor)
+    together = make_candidate_actor(policy, actor, K, deterministic=True)
+    together.assign(range(K), thetas)
+    with pytest.raises(ValueError, match="Unexpected observation shape"):
+        together.act(np.zeros((K, 5), dtype=np.float32))
     assert th.equal(parameters.read(actor), before)
-    for i in range(K):
-        parameters.write(actor, thetas[i])
-        alone, _ = policy.predict(take(obs, i), deterministic=True)
-        expected_action = alone + getattr(actions, "start", 0)
-        np.testing.assert_allclose(batched[i], expected_action, rtol=1e-4, atol=1e-5)
-        assert actions.contains(batched[i].astype(actions.dtype))
 
 
 @pytest.mark.parametrize("actions", ACTIONS, ids=str)
@@ -113,12 +180,15 @@ def test_the_mode_is_that_of_the_distribution(actions: spaces.Space) -> None:
     assert th.equal(mode(outputs, actions), expected)
 
 
+@pytest.mark.parametrize("temperature", [1, 3])
 @pytest.mark.parametrize("actions", ACTIONS, ids=str)
-def test_stochastic_candidates_sample_the_policy(actions: spaces.Space) -> None:
+def test_stochastic_candidates_sample_the_policy(actions: spaces.Space, temperature: float) -> None:
     n = 4000
     policy = ActorCriticPolicy(BOX, actions, lambda _: 1e-3)
+    if not isinstance(actions, spaces.Box):
+        set_temperature(policy, temperature)
     actor, thetas = perturbed(policy, 1)
-    together = make_actor(policy, actor, n, deterministic=False)
+    together = make_candidate_actor(policy, actor, n, deterministic=False)
     together.assign(range(n), thetas.expand(n, -1))
     obs = sample(BOX, 1).repeat(n, axis=0)
     drawn = together.act(obs).reshape(n, -1).astype(float)
@@ -147,74 +217,77 @@ class Counting(gym.Env):
         return np.array([self.draw, 1], dtype=np.float32), 1.0, self.steps >= length, False, {}
 
 
-def lengths_policy(lengths: list[int]) -> tuple[ActorCriticPolicy, list[th.nn.Parameter], th.Tensor]:
-    """A linear policy of which candidate i ends its episodes after ``lengths[i]`` steps of ``Counting``."""
-    policy = LinearPolicy(Counting.observation_space, Counting.action_space, lambda _: 1e-3)
-    return (
-        policy,
-        parameters.actor_parameters(policy),
-        th.tensor([[0.0, (length - 1) / 10] for length in lengths]).double(),
-    )
-
-
-def record(steps: list[Step]) -> Any:
-    return steps.append
+def evaluate(
+    env: VecEnv,
+    lengths: list[int],
+    seeds: np.ndarray | None = None,
+    n_episodes: int = 1,
+    max_episode_steps: int = 100,
+) -> tuple[np.ndarray, list[CandidateStep]]:
+    """The returns and steps of linear policies, of which candidate i ends its episodes after ``lengths[i]`` steps."""
+    policy = LinearPolicy(env.observation_space, Counting.action_space, lambda _: 1e-3)
+    actor = make_candidate_actor(policy, parameters.actor_parameters(policy), env.num_envs, True)
+    # The last observation is 1
+    thetas = th.zeros(len(lengths), *env.observation_space.shape).double()
+    thetas[:, -1] = (th.tensor(lengths) - 1) / 10
+    steps: list[CandidateStep] = []
+    return evaluate_candidates(actor, env, thetas, seeds, n_episodes, max_episode_steps, steps.append), steps
 
 
 @pytest.mark.parametrize("seeded", [True, False])
 @pytest.mark.parametrize("n_envs", [1, 3, 8])
 def test_every_candidate_has_exactly_its_episodes(n_envs: int, seeded: bool) -> None:
     lengths, n_episodes = [1, 9, 2, 5, 1], 2
-    policy, actor, thetas = lengths_policy(lengths)
-    env, steps = make_vec_env(Counting, n_envs), []
     seeds = np.arange(10).reshape(5, 2) if seeded else None
-    returns = evaluate(make_actor(policy, actor, n_envs, True), env, thetas, seeds, n_episodes, 100, record(steps))
+    returns, steps = evaluate(make_vec_env(Counting, n_envs), lengths, seeds, n_episodes)
     np.testing.assert_array_equal(returns, np.repeat(np.array(lengths)[:, None], 2, axis=1))
     ended = Counter(step.infos[i]["episode"]["l"] for step in steps for i in np.flatnonzero(step.finished))
     assert ended == Counter(lengths * n_episodes)
 
 
 def test_a_queue_without_rounds_leaves_no_environment_idle_while_it_lasts() -> None:
-    policy, actor, thetas = lengths_policy([9] + [3] * 6)
-    steps: list[Step] = []
-    evaluate(make_actor(policy, actor, 3, True), make_vec_env(Counting, 3), thetas, None, 1, 100, record(steps))
+    _, steps = evaluate(make_vec_env(Counting, 3), [9] + [3] * 6)
     # 27 steps of candidates in three environments
     assert len(steps) == 9
 
 
 def test_rounds_and_queue_hold_every_pair_once() -> None:
     pairs = [(candidate, episode) for episode in range(2) for candidate in range(5)]
-    assert queues(5, 2, 4, in_rounds=False) == [pairs]
-    rounds = queues(5, 2, 4, in_rounds=True)
+    assert schedule_episodes(5, 2, 4, in_rounds=False) == [pairs]
+    rounds = schedule_episodes(5, 2, 4, in_rounds=True)
     assert [pair for queue in rounds for pair in queue] == pairs and max(map(len, rounds)) == 4
 
 
-def wrap(name: str) -> Any:
-    if name == "SubprocVecEnv":
-        return SubprocVecEnv([Counting] * 3)
-    env = DummyVecEnv([Counting] * 3)
-    wrappers = {
-        "DummyVecEnv": lambda x: x,
-        "VecNormalize": VecNormalize,
-        "VecFrameStack": lambda x: VecFrameStack(x, 2),
-    }
-    return wrappers[name](env)
+WRAPPERS: dict[str, Callable[[], VecEnv]] = {
+    "DummyVecEnv": lambda: DummyVecEnv([Counting] * 3),
+    "SubprocVecEnv": lambda: SubprocVecEnv([Counting] * 3),
+    "VecNormalize": lambda: VecNormalize(DummyVecEnv([Counting] * 3), training=False),
+    "VecFrameStack": lambda: VecFrameStack(DummyVecEnv([Counting] * 3), 2),
+}
 
 
-@pytest.mark.parametrize("name", ["DummyVecEnv", "SubprocVecEnv", "VecNormalize", "VecFrameStack"])
+@pytest.mark.parametrize("name", WRAPPERS)
 def test_equal_seeds_are_equal_starts_in_every_environment_and_at_every_time(name: str) -> None:
-    env = wrap(name)
-    if isinstance(env, VecNormalize):
-        env.training = False
+    env = WRAPPERS[name]()
     seeds = np.array([[11], [11], [12], [12], [11], [13]])
-    first = start(env, [(0, 0), (1, 0), (2, 0)], seeds)
+    first = start_episodes(env, [(0, 0), (1, 0), (2, 0)], seeds)
     for _ in range(5):
         env.step(np.zeros((3, 1), dtype=np.float32))
-    second = start(env, [(3, 0), (4, 0), (5, 0)], seeds)
+    second = start_episodes(env, [(3, 0), (4, 0), (5, 0)], seeds)
     env.close()
     assert np.array_equal(first[0], first[1]) and np.array_equal(first[0], second[1])
     assert np.array_equal(first[2], second[0])
     assert len({row.tobytes() for row in (first[0], first[2], second[2])}) == 3
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_pending_seeds_do_not_keep_candidates_from_sharing_a_start(name: str) -> None:
+    env = WRAPPERS[name]()
+    env.seed(0)
+    _, steps = evaluate(env, [3] * 6, np.full((6, 1), 11))
+    env.close()
+    first, second = steps[0].new_obs, steps[3].new_obs
+    assert np.array_equal(first, second) and (first == first[0]).all()
 
 
 @pytest.mark.parametrize("what", ["reward", "observation"])
@@ -226,10 +299,8 @@ def test_a_number_that_is_not_finite_is_named(what: str) -> None:
                 obs, reward = (obs, np.nan) if what == "reward" else (obs * np.inf, reward)
             return obs, reward, terminated, truncated, info
 
-    policy, actor, thetas = lengths_policy([2, 3, 1, 7])
-    env = make_vec_env(Broken, 2)
     with pytest.raises(ValueError, match=f"The {what} of candidate 3, episode 0, step 3 .* is not finite"):
-        evaluate(make_actor(policy, actor, 2, True), env, thetas, None, 1, 100, record([]))
+        evaluate(make_vec_env(Broken, 2), [2, 3, 1, 7])
 
 
 def test_large_finite_numbers_are_no_error() -> None:
@@ -238,19 +309,16 @@ def test_large_finite_numbers_are_no_error() -> None:
             obs, _, *rest = super().step(action)
             return obs, 1e30, *rest
 
-    policy, actor, thetas = lengths_policy([2])
-    returns = evaluate(make_actor(policy, actor, 1, True), make_vec_env(Large, 1), thetas, None, 1, 100, record([]))
-    assert returns[0, 0] == pytest.approx(2e30)
+    assert evaluate(make_vec_env(Large, 1), [2])[0][0, 0] == pytest.approx(2e30)
 
 
 @pytest.mark.parametrize("seeded", [True, False])
 def test_an_episode_that_does_not_end_is_named(seeded: bool) -> None:
-    policy, actor, thetas = lengths_policy([2, 3, 9])
     seeds = np.zeros((3, 1), dtype=int) if seeded else None
     env = make_vec_env(Counting, 2)
     with pytest.raises(ValueError, match=r"max_episode_steps=8 steps .candidate 2, episode 0"):
-        evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 8, record([]))
-    evaluate(make_actor(policy, actor, 2, True), env, thetas, seeds, 1, 9, record([]))
+        evaluate(env, [2, 3, 9], seeds, max_episode_steps=8)
+    evaluate(env, [2, 3, 9], seeds, max_episode_steps=9)
 
 
 def test_a_vec_env_that_cannot_seed_its_environments_is_an_error() -> None:
@@ -259,4 +327,4 @@ def test_a_vec_env_that_cannot_seed_its_environments_is_an_error() -> None:
             raise NotImplementedError
 
     with pytest.raises(ValueError, match="set common_random_numbers=False"):
-        start(Unseedable([Counting]), [(0, 0)], np.zeros((1, 1), dtype=int))
+        start_episodes(Unseedable([Counting]), [(0, 0)], np.zeros((1, 1), dtype=int))

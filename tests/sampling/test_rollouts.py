@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.estimation.rollout import Extent
+from sb3_reinforce.sampling.collection import Extent
 
 CUTS = "ignore:Episodes that n_steps cuts"
 
@@ -45,7 +45,7 @@ def test_lengths_of_used_episodes_are_drawn_without_bias():
     """Lengths of 1 and 100: "the first to finish" would use far more short ones than half."""
     env = make_vec_env(lambda: Corridor((1, 100)), 4, seed=0)
     model = REINFORCE("MlpPolicy", env, n_episodes=6, baseline="none", seed=0, device="cpu", learning_rate=0.0)
-    keep = Keep(lambda model: model._rollout.used.sum().item())
+    keep = Keep(lambda model: model.rollout.used.sum().item())
     model.learn(80_000, callback=keep)
     n_episodes = 6 * len(keep.kept)
     mean, std = 50.5, 49.5
@@ -64,7 +64,7 @@ def test_logged_episodes_are_those_that_are_used():
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_whole_episodes_count_every_step_and_start_anew(n_envs):
     model = make_model(lambda: Corridor((2, 9)), n_envs, n_episodes=5, baseline="none")
-    keep = Keep(lambda model: (model.rollout_buffer.size(), model._rollout.timesteps[0].tolist()))
+    keep = Keep(lambda model: (model.rollout_buffer.size(), model.rollout.timesteps[0].tolist()))
     model.learn(300, callback=keep)
     assert model.num_timesteps == n_envs * sum(size for size, _ in keep.kept)
     assert all(first == [0] * n_envs for _, first in keep.kept)
@@ -88,7 +88,7 @@ def test_a_cut_episode_without_a_critic_is_left_out_with_a_warning():
     model = make_model(lambda: Corridor((4,)), 1, n_steps=10, baseline="none")
     with pytest.warns(UserWarning, match="n_episodes"):
         model.learn(10)
-    assert model._rollout.used.flatten().tolist() == [True] * 8 + [False] * 2
+    assert model.rollout.used.flatten().tolist() == [True] * 8 + [False] * 2
     assert model.rollout_buffer.advantages[8:].tolist() == [[0], [0]]
 
 

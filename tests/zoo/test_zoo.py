@@ -1,5 +1,6 @@
 """The RL Zoo's commands end to end, for both algorithms and one of the Zoo's own."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,20 +12,14 @@ pytest.importorskip("matplotlib")
 
 import gymnasium as gym
 import rl_zoo3
-import torch as th
 import yaml
 from matplotlib import pyplot
 from zoo_commands import NAMES, RUN, config_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
-
-
-def parameters(path: Path) -> th.Tensor:
-    name = path.parent.parent.name
-    return th.nn.utils.parameters_to_vector(rl_zoo3.ALGOS[name].load(path, device="cpu").policy.parameters())
 
 
 @pytest.fixture(scope="module")
@@ -54,40 +49,29 @@ def test_train_finds_the_settings_without_a_conf_file(name: str, folder: Path) -
     assert {"CartPole-v1.zip", "best_model.zip", "evaluations.npz"} <= {path.name for path in run.iterdir()}
 
 
-@pytest.mark.parametrize("which", [(), ("--load-best",), ("--load-last-checkpoint",)])
 @pytest.mark.parametrize("name", NAMES)
-def test_enjoy(name: str, which: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
-    assert "Mean reward: " in capsys.readouterr().out
+def test_enjoy(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for which in ((), ("--load-best",), ("--load-last-checkpoint",)):
+        zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
+        assert "Mean reward: " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_record_video(name: str, folder: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pygame")
-    zoo("record_video", "--algo", name, "-f", "logs", "--exp-id", "1", "-n", "20", "-o", str(tmp_path))
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
-
-
-def test_record_video_takes_environments_of_other_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["reinforce", "finite_difference"])
+def test_record_video_also_of_an_environment_of_another_package(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("pygame")
     (tmp_path / "own_envs.py").write_text(
         "import gymnasium as gym\n"
         "gym.register('Own-v0', 'gymnasium.envs.classic_control.cartpole:CartPoleEnv', max_episode_steps=50)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    common = ("--algo", "reinforce", "--env", "Own-v0", "--gym-packages", "own_envs", "-f", str(tmp_path), "-n", "40")
+    monkeypatch.delitem(sys.modules, "own_envs", raising=False)
+    common = ("--algo", name, "--env", "Own-v0", "--gym-packages", "own_envs", "-f", str(tmp_path), "-n", "40")
     zoo("train", *common)
     zoo("record_video", *common, "-o", str(tmp_path / "videos"))
     gym.registry.pop("Own-v0")
     assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_train_goes_on_from_a_model(name: str, folder: Path, tmp_path: Path) -> None:
-    path = folder / "logs" / name / RUN / "CartPole-v1.zip"
-    train(name, "-n", "100", "-i", str(path), "-params", "learning_rate:0.0", "-f", str(tmp_path), "--eval-freq", "-1")
-    # With a rate of 0 what is saved is what was loaded
-    assert th.equal(parameters(path), parameters(tmp_path / name / RUN / path.name))
 
 
 def test_statistics_of_normalization_come_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,10 +81,12 @@ def test_statistics_of_normalization_come_back(tmp_path: Path, capsys: pytest.Ca
     assert "Loading running average" in capsys.readouterr().out
 
 
-def test_benchmark_evaluates_every_algorithm(folder: Path) -> None:
-    zoo("benchmark", "--log-dir", "logs", "--benchmark-dir", "benchmark", "--no-hub", "-n", "600", "--num-threads", "1")
-    rows = (folder / "benchmark.md").read_text()
-    assert all(f"|{name}" in rows for name in NAMES)
+def test_benchmark_evaluates_the_algorithms_of_this_package(folder: Path, tmp_path: Path) -> None:
+    # The Zoo starts a process for each model: here only for this one
+    shutil.copytree(folder / "logs" / "finite_difference" / RUN, tmp_path / "finite_difference" / RUN)
+    arguments = ("--no-hub", "-n", "600", "--num-threads", "1")
+    zoo("benchmark", "--log-dir", str(tmp_path), "--benchmark-dir", str(tmp_path / "results"), *arguments)
+    assert "|finite_difference|CartPole-v1|" in (folder / "benchmark.md").read_text().replace(" ", "")
 
 
 def test_plots(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,7 +97,7 @@ def test_plots(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     zoo("all_plots", "-a", *NAMES, "-e", "CartPole-v1", "-f", "logs", "-o", "results", "--no-million")
     table = capsys.readouterr().out
     assert all(name.upper() in table for name in NAMES)
-    zoo("plot_from_file", "-i", "results", "--rliable", "--versus", "--iqm", "-o", "figure.png", "--format", "png")
+    zoo("plot_from_file", "-i", "results", "-o", "figure.png", "--format", "png")
     assert (folder / "figure.png").stat().st_size > 0
 
 

@@ -1,13 +1,7 @@
 """Which settings an algorithm gets in the Zoo: published, of a model, of a trial; and what they are turned into."""
 
-import argparse
-import importlib
-import inspect
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 
@@ -21,20 +15,13 @@ import torch as th
 import yaml
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
-from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from zoo_commands import RUN, config_of, train, zoo
+from zoo_commands import RUN, config_of, message_of, train, zoo
 
-import sb3_reinforce.zoo
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
-# The Zoo and what it calls warn of their own affairs
+# The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
-TASKS = {
-    "CartPole-v1", "Acrobot-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1", "LunarLander-v3",
-    "LunarLanderContinuous-v3", "BipedalWalker-v3", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Swimmer-v5",
-    "Ant-v5", "InvertedPendulum-v5", "Reacher-v5",
-}  # fmt: skip
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
     "finite_difference": {"learning_rate", "delta_std"},
@@ -54,18 +41,6 @@ def conf(folder: Path, **entries: Any) -> tuple[str, ...]:
     """Arguments that name a configuration with these entries, whose runs go to the same folder."""
     (folder / "conf.yml").write_text(yaml.safe_dump(entries))
     return "-conf", str(folder / "conf.yml"), "-f", str(folder), "--eval-freq", "-1"
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_default_trains_on_observations_that_cannot_be_normalized(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="FrozenLake-v1")
-    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
-    assert published.pop("normalize")
-    assert config_of(tmp_path / name / "FrozenLake-v1_1") == published
-    zoo("enjoy", "--algo", name, "--env", "FrozenLake-v1", "-f", str(tmp_path), "--no-render", "-n", "100")
-    assert "Mean reward: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -88,26 +63,21 @@ class Dicts(gym.ObservationWrapper[Any, Any, Any]):
         return {"obs": observation, "one": 1}
 
 
+@pytest.mark.parametrize(("env", "changed"), [("FrozenLake-v1", {}), ("Dicts-v0", {"policy": "MultiInputPolicy"})])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_default_trains_on_dicts(name: str, tmp_path: Path) -> None:
-    gym.register("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
-    try:
-        train(name, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), env="Dicts-v0")
-    finally:
-        del gym.registry["Dicts-v0"]
-    config = config_of(tmp_path / name / "Dicts-v0_1")
-    assert config["policy"] == "MultiInputPolicy" and "normalize" not in config
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_model_can_be_loaded_without_the_zoo(name: str, tmp_path: Path) -> None:
-    entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1") | {"policy": "MlpPolicy", "n_timesteps": 64}
-    train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
-    path, algorithm = str(tmp_path / name / RUN / "CartPole-v1.zip"), ALGORITHMS[name].__name__
-    code = "import sys; sys.modules['rl_zoo3'] = None; import sb3_reinforce as s"
-    code += f"; print(s.{algorithm}.load({path!r}).learning_rate(0.5))"
-    told = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.split()[-1] == "0.25"
+def test_the_published_default_trains_on_observations_that_cannot_be_normalized(
+    name: str, env: str, changed: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    spec = gym.envs.registration.EnvSpec("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Dicts-v0", spec)
+    common = ("-f", str(tmp_path), "-n", "100")
+    train(name, *common, "--eval-freq", "-1", env=env)
+    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
+    assert published.pop("normalize")
+    assert config_of(tmp_path / name / f"{env}_1") == published | changed
+    zoo("enjoy", "--algo", name, "--env", env, *common, "--no-render")
+    assert "Mean reward: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -146,25 +116,10 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path: Path) -> None
     assert load(tmp_path / "reinforce" / "CartPole-v1_2").gamma == 0.5
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_the_settings_are_found_beside_an_installed_and_a_cloned_zoo(installed: bool) -> None:
-    # Where this folder is missing the Zoo looks one above
-    with mock.patch.object(Path, "is_dir", lambda path: installed):
-        manager = ExperimentManager(argparse.Namespace(), "reinforce", "CartPole-v1", "")
-    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())["CartPole-v1"]
-    assert manager.read_hyperparameters()[0] == published
-
-
-def test_a_reload_changes_nothing() -> None:
-    importlib.reload(sb3_reinforce.zoo.experiments)
-    importlib.reload(sb3_reinforce.zoo)
-    for name in ("read_hyperparameters", "_preprocess_hyperparams", "setup_experiment"):
-        method = getattr(ExperimentManager, name).__wrapped__
-        assert method is inspect.unwrap(method) and method.__globals__["__name__"] == "rl_zoo3.exp_manager"
-
-
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optuna_tunes_and_its_trials_can_be_trained(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
     train(name, "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--no-optim-plots", *study)
@@ -173,9 +128,11 @@ def test_optuna_tunes_and_its_trials_can_be_trained(name: str, tmp_path: Path, m
     assert [trial.state.name for trial in trials] == ["COMPLETE", "COMPLETE"]
     for number, trial in enumerate(trials):
         train(name, *study, "--trial-id", str(number))
-        assert (
-            config_of(Path(f"logs/{name}/CartPole-v1_{number + 2}"))["learning_rate"] == trial.params["learning_rate"]
-        )
+        config = config_of(Path(f"logs/{name}/CartPole-v1_{number + 2}"))
+        assert config["learning_rate"] == trial.params["learning_rate"]
+    for options in (("--trial-id", "7"), ("--study-name", "other", "--trial-id", "0")):
+        message = message_of(capsys, "train", "--algo", name, *study, *options)
+        assert f"no trial {options[-1]} of {name} in a study '{'other' if 'other' in options else 'study'}'" in message
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -191,20 +148,10 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name: s
             ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
 
 
-def test_the_settings_cover_what_is_promised() -> None:
-    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
-    assert published.keys() >= TASKS | {"atari", "default"}
+ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
 
 
-@pytest.mark.parametrize(
-    ("name", "env"),
-    [
-        (name, env)
-        for name in ALGORITHMS
-        for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
-        if env not in ("atari", "default")
-    ],
-)
+@pytest.mark.parametrize(("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default")])
 def test_every_entry_trains(name: str, env: str, tmp_path: Path) -> None:
     try:
         rl_zoo3.utils.gym.make(env).close()

@@ -6,6 +6,7 @@ from typing import Any
 from unittest import mock
 
 import matplotlib
+import pytest
 import yaml
 
 from sb3_reinforce.zoo import ALGORITHMS
@@ -23,6 +24,13 @@ def zoo(*arguments: str) -> None:
 
 def train(name: str, *arguments: str, env: str = "CartPole-v1") -> None:
     zoo("train", "--algo", name, "--env", env, "--seed", "1", "--eval-episodes", "2", *arguments)
+
+
+def message_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The last sentence of a command that exits with an error."""
+    with pytest.raises(SystemExit):
+        zoo(*arguments)
+    return capsys.readouterr().err.rpartition("error: ")[2]
 
 
 def config_of(run: Path) -> dict[str, Any]:

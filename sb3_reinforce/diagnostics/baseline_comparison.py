@@ -1,0 +1,213 @@
+"""Every baseline on the same episodes: which one leaves the least noise in the gradient of a task."""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import cast
+
+import torch as th
+
+from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.diagnostics.sampling import check_independent, check_model, sample, seeded
+from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise, variance
+from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resamples
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline, ratio_of_others
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.weights import check_baseline
+from sb3_reinforce.reinforce import REINFORCE
+
+
+@dataclass(frozen=True)
+class BaselineRow:
+    """
+    One baseline of a comparison.
+
+    :param baseline: Its name
+    :param variance: tr Σ, the trace of the covariance of the gradient of one episode
+    :param ratio: tr Σ divided by the tr Σ of the reference, from the same resamples of the same episodes
+    :param snr: ``‖E g‖² / tr Σ`` of one episode; the mean of N episodes has N times that
+    :param bias: ``‖E g − E g_none‖ / ‖E g_none‖`` where it is known in theory, else NaN
+    :param seconds: Time to compute b_t
+    """
+
+    baseline: str
+    variance: Estimate
+    ratio: Estimate
+    snr: Estimate
+    bias: float
+    seconds: float
+
+
+def compare_baselines(
+    model: REINFORCE,
+    n_episodes: int = 100,
+    baselines: Iterable[str | Baseline] | None = None,
+    reference: str = "none",
+    n_resamples: int = 500,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Table[BaselineRow]:
+    """
+    Measure the noise that each baseline leaves in the gradient of the same whole episodes.
+
+    The model's policy samples the episodes, with the model's own returns (γ, λ, reward-to-go); the gradient of an
+    episode is the sum over its steps. The table always has the row ``"none"``, and ends with the ``"floor"``: the best
+    constant for each single component of the gradient, fitted to these episodes. No scalar constant has a smaller
+    variance; a baseline that depends on the time or the state can.
+
+    With an MlpPolicy, all names together cost one to two plain forward and backward passes over the episodes, which
+    ``examples/benchmarks/comparison_cost.py`` measures.
+
+    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param n_episodes: Number of episodes, at least 3
+    :param baselines: Names or functions; None for all names, ``"value"`` only if the model has a critic
+    :param reference: Name of the baseline in the denominator of ``ratio``
+    :param n_resamples: Number of bootstrap resamples
+    :param confidence: Probability with which an interval should cover the true value
+    :param seed: Seed of the resamples and of the actions; the environments continue with their own generators
+    :return: A table with one ``BaselineRow`` per baseline
+    :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
+    :raises ValueError: If there are too few episodes, a name is unknown or used twice, ``"value"`` is given without a
+        critic, the reference is not among the baselines, or the episodes are not independent because they share the
+        noise of gSDE
+    """
+    check_model(model)
+    check_independent(model)
+    functions = functions_of(model, baselines)
+    check_integer("n_episodes", n_episodes, 3)
+    check_choice("reference", reference, tuple(functions))
+    check_number("confidence", confidence, 0, 1)
+    counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
+    with seeded(model.policy, seed):
+        rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
+    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes; floor: of constants)", rows)
+
+
+def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -> dict[str, Baseline]:
+    """Check the baselines to compare, and return them by name, ``"none"`` first."""
+    if baselines is None:
+        baselines = [name for name in BASELINES if name != "value" or model.has_critic]
+    functions: dict[str, Baseline] = {"none": BASELINES["none"]}
+    if not isinstance(baselines, Iterable) or isinstance(baselines, str):
+        baselines = [cast(str | Baseline, baselines)]
+    for baseline in baselines:
+        function = check_function("baselines", baseline, BASELINES)
+        if function is BASELINES["value"] and not model.has_critic:
+            raise ValueError(
+                f"baselines has 'value', but the model has no critic, as its baseline is {model.baseline!r}: leave "
+                "'value' out, or train a model with baseline='value'"
+            )
+        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
+        if name in ("optimal", "floor") and function is not BASELINES.get(name):
+            raise ValueError(
+                f"baselines has a function named {name!r}, which is the name of a row: give it another name"
+            )
+        if functions.setdefault(name, function) is not function:
+            raise ValueError(f"baselines must have names that differ, and two of its functions are named {name!r}")
+    return functions
+
+
+def baseline_rows(
+    rollout: Rollout, functions: dict[str, Baseline], reference: str, counts: th.Tensor, confidence: float
+) -> list[BaselineRow]:
+    """The rows of ``compare_baselines`` from whole episodes, with ``counts`` (r, m) of their resamples."""
+    values = {}
+    seconds = {"floor": float("nan")}
+    for name, function in functions.items():
+        if function is not BASELINES["optimal"]:
+            begin = time.perf_counter()
+            values[name] = th.as_tensor(check_baseline(function(rollout), rollout))
+            seconds[name] = time.perf_counter() - begin
+    grams, seconds["optimal"] = gram_matrices(rollout, values)
+    moments = {name: compute_moments(grams[name], counts) for name in (*functions, "floor")}
+    return [
+        BaselineRow(
+            baseline=name,
+            variance=interval(variance(of), confidence),
+            ratio=interval(variance(of) / variance(moments[reference]), confidence),
+            snr=UNKNOWN if name == "floor" else interval(signal_to_noise(of), confidence),
+            bias=float("nan") if name == "floor" else relative_bias(functions[name], rollout),
+            seconds=seconds[name],
+        )
+        for name, of in moments.items()
+    ]
+
+
+def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
+    """``‖E g − E g_none‖ / ‖E g_none‖``: 0, 1/N if each of N returns is part of its own mean, or NaN if unknown."""
+    if baseline in [BASELINES[name] for name in ("none", "leave_one_out", "value", "optimal")]:
+        return 0.0
+    lengths = th.unique(rollout.episodes[rollout.used], return_counts=True)[1]
+    one_length = bool((lengths == lengths[0]).all())
+    one_step = bool((lengths == 1).all())
+    own_return_in_mean = (baseline is BASELINES["time_mean"] and one_length) or (
+        baseline is BASELINES["mean"] and one_step
+    )
+    return 1 / len(lengths) if own_return_in_mean else float("nan")
+
+
+def gram_matrices(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
+    """
+    ``K_ij = ⟨g_i, g_j⟩`` (m, m) by baseline b_t (n_steps, n_envs), for ``"optimal"`` and for the ``"floor"``; and the
+    seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
+
+    A baseline b that is constant along an episode leaves A − b S, so that its K, and that of the optimal one, follow
+    from the products of A and S. Every other baseline is one more weight in the same pass.
+    """
+    rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)[1]
+    n_episodes = int(rank.max()) + 1
+    constants: dict[str, th.Tensor] = {}
+    weights: dict[str, th.Tensor] = {}
+    for name, baseline in baselines.items():
+        along = baseline[rollout.used]
+        b = along.new_zeros(n_episodes).index_copy_(0, rank, along)
+        if th.equal(b[rank], along):
+            constants[name] = b
+        else:
+            weights[name] = rollout.discounts * (rollout.returns - baseline)
+
+    names = ("A A", "A S", "S S", "floor", *weights)
+    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in names}
+    seconds = 0.0
+    begin = time.perf_counter()
+    for weighted, scores, *others in gradient_blocks(
+        rollout, rollout.discounts * rollout.returns, rollout.discounts, *weights.values()
+    ):
+        seconds += (time.perf_counter() - begin) * 2 / (2 + len(others))
+        products = gram(th.cat([weighted, scores]))
+        found["A A"] += products[:n_episodes, :n_episodes]
+        found["A S"] += products[:n_episodes, n_episodes:]
+        found["S S"] += products[n_episodes:, n_episodes:]
+        found["floor"] += gram(componentwise_residuals(weighted, scores))
+        for name, gradients in zip(weights, others, strict=True):
+            found[name] += gram(gradients)
+        begin = time.perf_counter()
+    a_a, a_s, s_s = (found.pop(name) for name in ("A A", "A S", "S S"))
+    # As the baseline itself computes them, from the products that are already here
+    constants["optimal"] = ratio_of_others(a_s.diagonal(), s_s.diagonal())
+    for name, b in constants.items():
+        # ⟨A_i − b_i S_i, A_j − b_j S_j⟩
+        found[name] = a_a - a_s * b - (a_s * b).T + s_s * b * b[:, None]
+    return found, seconds
+
+
+def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
+    """``gradients_by_episode`` in blocks ``(k, m, c)`` of c components of θ, at most ``floats`` numbers each."""
+    n_parameters = sum(parameter.numel() for parameter in scored_parameters(rollout))
+    n_columns = max(1, floats // (len(weights) * len(th.unique(rollout.episodes[rollout.used]))))
+    for start in range(0, n_parameters, n_columns):
+        yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))
+
+
+def componentwise_residuals(weighted: th.Tensor, scores: th.Tensor) -> th.Tensor:
+    """
+    ``A_ik − b_k S_ik`` (m, n) with the constant of least variance ``b_k = Cov(A_k, S_k) / Var(S_k)`` for component k.
+
+    Peters and Schaal (2008), section 3.2, with sample covariances for E[A S] and E[S²], as E[S] = 0. Fitted to the
+    episodes that it is applied to, the variance is too small by about 1/m.
+    """
+    centred = scores - scores.mean(0)
+    squares = centred.square().sum(0)
+    best = ((weighted - weighted.mean(0)) * centred).sum(0) / squares.clamp(min=th.finfo(squares.dtype).tiny)
+    return weighted - best * scores

@@ -1,0 +1,27 @@
+"""An optimizer step from given gradients."""
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_reinforce.common.optimization import step
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_step_reads_a_gradient_in_the_memory_layout_of_its_parameter(fused):
+    """A fused optimizer goes through both side by side."""
+    rows, columns = (nn.Parameter(w) for w in (th.arange(6.0).view(2, 3), th.arange(6.0).view(2, 3).T.contiguous().T))
+    gradient = th.tensor([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
+    assert rows.stride() != columns.stride()
+    for parameter in (rows, columns):
+        adam = th.optim.Adam([parameter], lr=0.1, fused=fused)
+        assert step(adam, [parameter], [gradient], None, "policy") == pytest.approx(6**0.5)
+    th.testing.assert_close(rows.detach(), th.arange(6.0).view(2, 3) - 0.1 * gradient)
+    assert th.equal(rows, columns)
+
+
+def test_a_step_takes_a_gradient_of_another_precision():
+    """As autocast makes it."""
+    parameter = nn.Parameter(th.zeros(2))
+    step(th.optim.SGD([parameter], lr=1.0), [parameter], [th.tensor([1.0, 2.0]).half()], None, "policy")
+    assert parameter.tolist() == [-1, -2]

@@ -1,0 +1,137 @@
+"""Which models the lab accepts, and that it leaves them and their training as they were."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch as th
+from environments import Corridor, Tree
+from gymnasium import spaces
+from stable_baselines3 import A2C
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import (
+    GradientQualityCallback,
+    PitfallCallback,
+    check_gradient,
+    compare_baselines,
+    compare_estimators,
+    landscape,
+    sample,
+)
+
+
+def lab():
+    """Every function that measures a model, at its cheapest."""
+    return {
+        "check_gradient": lambda model: check_gradient(model, 2),
+        "compare_baselines": lambda model: compare_baselines(model, 4, n_resamples=2),
+        "compare_estimators": lambda model: compare_estimators(model, 4, 3, n_delta=2, n_resamples=2),
+        "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
+        "sample": lambda model: sample(model, 2),
+    }
+
+
+callbacks = {"pitfalls": PitfallCallback, "quality": lambda: GradientQualityCallback(1)}
+
+
+def trained(callback=None, **kwargs):
+    return REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 4, seed=0), seed=0, device="cpu", **kwargs).learn(
+        512, callback
+    )
+
+
+@pytest.mark.parametrize("callback", callbacks)
+@pytest.mark.parametrize("kwargs", [{}, {"baseline": "leave_one_out", "n_episodes": 6}])
+def test_training_is_the_same_with_a_callback(callback, kwargs):
+    ours, theirs = trained(callbacks[callback](), **kwargs), trained(**kwargs)
+    for with_it, without in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert th.equal(with_it, without)
+    assert ours.num_timesteps == theirs.num_timesteps
+
+
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_a_model_is_as_it_was_and_goes_on(measure):
+    env = VecNormalize(make_vec_env(lambda: Corridor((3, 7), action_space=spaces.Box(-1, 1, (1,))), 2, seed=0))
+    model = REINFORCE("MlpPolicy", env, n_steps=8, seed=0, device="cpu").learn(16)
+
+    def state():
+        counts = env.obs_rms.count, env.ret_rms.count, len(model.ep_info_buffer), env.training
+        arguments = model.n_steps, model.n_episodes, model.baseline, model.gamma, model.max_grad_norm
+        return model.num_timesteps, model.logger, model.policy.optimizer, counts, arguments
+
+    before, parameters = state(), {name: value.clone() for name, value in model.policy.state_dict().items()}
+    measure(model)
+    assert state() == before
+    assert all(th.equal(value, parameters[name]) for name, value in model.policy.state_dict().items())
+    model.learn(16, reset_num_timesteps=False)
+    assert model.num_timesteps == 32
+    assert model.rollout.timesteps[0].tolist() == [0, 0]
+    assert (model.rollout.observations[0].argmax(-1) == 0).all()
+
+
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_a_model_without_environments_is_refused(measure):
+    model = REINFORCE("MlpPolicy", Tree(), device="cpu")
+    model.env = None
+    with pytest.raises(ValueError, match="set_env"):
+        measure(model)
+
+
+@pytest.mark.parametrize("name", ["check_gradient", "compare_baselines", "compare_estimators", "sample"])
+def test_other_models_are_refused(name):
+    with pytest.raises(TypeError, match="must be a REINFORCE"):
+        lab()[name](A2C("MlpPolicy", "CartPole-v1", device="cpu"))
+
+
+@pytest.mark.parametrize("callback", callbacks)
+def test_callbacks_refuse_other_models(callback):
+    with pytest.raises(TypeError, match="must be a REINFORCE"):
+        A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callbacks[callback]())
+
+
+def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
+    model = REINFORCE("MlpPolicy", Corridor(action_space=spaces.Box(-1, 1, (1,))), use_sde=True, device="cpu")
+    for measure in (compare_baselines, compare_estimators, lambda m: m.learn(64, GradientQualityCallback(1))):
+        with pytest.raises(ValueError, match="use_sde=True and sde_sample_freq=-1"):
+            measure(model)
+
+
+def test_nothing_here_needs_the_extras():
+    """Neither training nor the lab, but for its figures, where matplotlib and pandas cannot be imported."""
+    script = """
+import sys
+sys.modules.update({"matplotlib": None, "pandas": None})
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback, check_gradient, compare_baselines
+model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", seed=0)
+model.learn(128, [GradientQualityCallback(1), PitfallCallback()])
+print(compare_baselines(model, 5), check_gradient(model).passed)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("True\n")
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_seed_makes_figures_reproducible(training):
+    """With episodes drawn by the environment's own generator, and actions by PyTorch's; in both modes of the policy."""
+    env = make_vec_env(lambda: Corridor((1, 2, 5), lambda t, action: float(action)), 4, seed=0)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+    model.policy.set_training_mode(training)
+
+    def figures(seed):
+        rows = compare_estimators(model, 12, 4, n_resamples=20, seed=seed).to_records()
+        return [{key: x for key, x in row.items() if key != "seconds"} for row in rows]
+
+    generator = th.get_rng_state()
+    first = figures(3)
+    np.testing.assert_equal(figures(3), first)
+    assert figures(4)[0]["snr_per_step"] != first[0]["snr_per_step"]
+    np.testing.assert_equal(*[landscape(model, n_points=2, seed=1).utilities for _ in range(2)])
+    compare_baselines(model, 5, n_resamples=2)
+    assert th.equal(th.get_rng_state(), generator)
+    assert model.policy.training == training
