@@ -166,9 +166,9 @@ class FiniteDifference(BasePolicyGradient):
         policy_class = cast(type[ActorCriticPolicy], self.policy_class)
         policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         self.policy = policy.to(self.device)
-        n_parameters = self.n_parameters
         if policy_class in (ActorCriticPolicy, LinearPolicy):
             self._maybe_recommend_cpu(policy_class.__name__)
+        n_parameters = self.n_parameters
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, n_parameters)
         if self._generator is None:

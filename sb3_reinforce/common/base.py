@@ -1,7 +1,5 @@
 """What both algorithms inherit: checked arguments, prediction, saving, loading and going on."""
 
-import pickle
-import random
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
@@ -18,7 +16,7 @@ from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, c
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
-from sb3_reinforce.common.states import check_finite, optimizer_mismatch
+from sb3_reinforce.common.states import check_finite, generator_states, optimizer_mismatch, restore_generators
 from sb3_reinforce.common.storage import PathOrFile, atomic_write, check_archive
 
 __all__ = ["BasePolicyGradient", "uninterrupted"]
@@ -27,8 +25,6 @@ Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
 LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"}
-
-
 # What a state dict of either algorithm may have
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
@@ -122,10 +118,7 @@ class BasePolicyGradient(BaseAlgorithm):
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written
         """
-        device = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
-        states = random.getstate(), np.random.get_state(), th.get_rng_state(), device
-        # As bytes, since Stable-Baselines3 would print each of their numbers into the file
-        self._random_state = pickle.dumps(states)
+        self._random_state = generator_states(self.device)
         with atomic_write(path) as file:
             super().save(file, exclude, include)
 
@@ -240,13 +233,3 @@ class BasePolicyGradient(BaseAlgorithm):
         except BaseException:
             super().set_parameters(before, device=device)
             raise
-
-
-def restore_generators(states: bytes, device: th.device) -> None:
-    """Restore the states of the global random generators, the device's too."""
-    python, numpy, torch, cuda = pickle.loads(states)
-    random.setstate(python)
-    np.random.set_state(numpy)
-    th.set_rng_state(torch)
-    if cuda is not None and device.type == "cuda":
-        th.cuda.set_rng_state(cuda, device)

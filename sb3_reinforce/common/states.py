@@ -1,5 +1,7 @@
-"""States of networks and optimizers, as of ``state_dict``: what is checked before a model takes them."""
+"""States of networks, optimizers and random generators: what a model saves, and checks before it takes them."""
 
+import pickle
+import random
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -50,3 +52,19 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
                     f"its {key} of parameter {index} must have shape {shape}, got {tuple(np.shape(moments.get(key)))}"
                 )
     return ""
+
+
+def generator_states(device: th.device) -> bytes:
+    """Return the states of the global random generators, as bytes, which Stable-Baselines3 does not print."""
+    cuda = th.cuda.get_rng_state(device) if device.type == "cuda" else None
+    return pickle.dumps((random.getstate(), np.random.get_state(), th.get_rng_state(), cuda))
+
+
+def restore_generators(states: bytes, device: th.device) -> None:
+    """Restore the states of the global random generators, and of the device's if it has one."""
+    python, numpy, torch, cuda = pickle.loads(states)
+    random.setstate(python)
+    np.random.set_state(numpy)
+    th.set_rng_state(torch)
+    if cuda is not None and device.type == "cuda":
+        th.cuda.set_rng_state(cuda, device)
