@@ -5,7 +5,7 @@ Both take the same actions for the same seed, up to rounding: the first draws it
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
@@ -28,19 +28,6 @@ from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, nump
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
 
-class Actor(Protocol):
-    """What draws the actions of a rollout."""
-
-    def act(self, obs: Any) -> Acted:
-        """Draw actions for observations of ``n_envs`` environments."""
-
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
-        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
-
-    def is_current(self, policy: ActorCriticPolicy) -> bool:
-        """Whether the policy would still act as this actor does."""
-
-
 class PolicyActor:
     """Acts by the policy's own methods."""
 
@@ -51,6 +38,7 @@ class PolicyActor:
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
+        """Draw actions for observations of ``n_envs`` environments."""
         obs = obs_as_tensor(obs, self.policy.device)
         if not self.route.forward:
             actions = self.policy.get_distribution(obs).get_actions()
@@ -60,6 +48,7 @@ class PolicyActor:
 
     @th.no_grad()
     def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
+        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
         if self.route.forward:
             return None
         policy = self.policy
@@ -68,6 +57,7 @@ class PolicyActor:
         return evaluate(policy, self.route, obs, rows, with_values=False)[0].cpu().numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
+        """Whether the policy would still act as this actor does."""
         return policy is self.policy
 
 
@@ -116,6 +106,9 @@ class NumpyActor:
             and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers
             and addresses_of(policy, self.layers) == self.addresses
         )
+
+
+Actor: TypeAlias = PolicyActor | NumpyActor
 
 
 def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int]:
