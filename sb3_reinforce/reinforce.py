@@ -60,8 +60,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     left out, since its return is not known. The value network is then never evaluated, except by a policy
     that overrides ``forward``, ``evaluate_actions`` or ``extract_features``, and never used.
 
-    The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on. A
-    features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
+    The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
+    A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
     which would move the policy a second time. The policy step trains it: ``vf_coef`` times the critic's squared error
     is then part of its loss.
 
@@ -444,7 +444,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        # The first rollout is drawn at the temperature of the run's start, not at the final temperature of the run before
+        # The first rollout has the temperature of the start, not the final one of an earlier run
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         return total_timesteps, callback
 
