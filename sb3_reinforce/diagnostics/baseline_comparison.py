@@ -135,7 +135,7 @@ def baseline_rows(
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
-    """``‖E g − E g_none‖ / ‖E g_none‖``: 0, 1/N if the mean of N returns includes each return itself, or NaN if unknown."""
+    """``‖E g − E g_none‖ / ‖E g_none‖``: 0, 1/N if each of N returns is in its mean, or NaN if unknown."""
     if baseline in [BASELINES[name] for name in ("none", "leave_one_out", "value", "optimal")]:
         return 0.0
     lengths = th.unique(rollout.episodes[rollout.used], return_counts=True)[1]
