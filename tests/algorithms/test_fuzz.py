@@ -168,8 +168,9 @@ def assert_trains(algorithm, env, arguments):
     elif algorithm is REINFORCE:
         assert len(model.ep_info_buffer) == min(model._n_updates * model.n_episodes, 100)
     else:
-        used = model._n_updates * len(np.concatenate(model._utility.candidates))
-        assert len(model.ep_info_buffer) == min(used * model.n_eval_episodes, 100) <= n_episodes
+        k = model.n_delta
+        n_candidates = model._n_updates * {"regression": k, "central": 2 * k, "forward": k + 1}[model.estimator]
+        assert len(model.ep_info_buffer) == min(n_candidates * model.n_eval_episodes, 100) <= n_episodes
 
 
 @fuzzed
