@@ -8,16 +8,16 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import flatten, take, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import Parameters
+from sb3_reinforce.policies.evaluation import Parameters, depends_on, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -37,10 +37,10 @@ class GradientQualityCallback(BaseCallback):
     estimate itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
-    rollout and are noisy if it has few episodes; with fewer than two nothing is logged. A measurement costs about one
-    forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, two more with
-    ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for it, and training is the
-    same with and without it.
+    rollout and are noisy if it has few episodes; with fewer than two, or while the actor is frozen, nothing is logged.
+    A measurement costs about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes``
+    episodes, two more with ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for
+    it, and training is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
@@ -69,7 +69,7 @@ class GradientQualityCallback(BaseCallback):
             self.last_model = self.model
             self.n_rollouts = 0
             self.thetas: list[th.Tensor] = []
-            self.parameters: Parameters = []
+            self.trainable: Parameters = []
         if isinstance(self.model, FiniteDifference):
             return
         check_model(self.model)
@@ -81,18 +81,37 @@ class GradientQualityCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model = self.model
+        self.n_rollouts += 1
+        is_due = self.n_rollouts % self.every == 0
+        figures: dict[str, float] = {}
         if isinstance(model, FiniteDifference):
             theta = model.theta
         else:
             rollout = cast(Rollout, cast(REINFORCE, model).rollout)
-            self.parameters = self.parameters or scored_parameters(rollout)
-            theta = to_vector(self.parameters)
+            parameters = self.actor_parameters(rollout)
+            if not parameters:
+                # The actor is frozen
+                return
+            theta = to_vector(parameters)
+            figures = self.measure(rollout) if is_due else {}
+        if self.thetas and self.thetas[-1].shape != theta.shape:
+            self.thetas = []
         self.thetas = [*self.thetas[-2:], theta]
-        self.n_rollouts += 1
-        if self.n_rollouts % self.every == 0:
-            figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)
-            for key, figure in figures.items():
+        if is_due:
+            for key, figure in (figures | self.cosine()).items():
                 self.logger.record(f"gradient/{key}", figure)
+
+    def actor_parameters(self, rollout: Rollout) -> Parameters:
+        """The trainable parameters that log π depends on."""
+        trainable = [parameter for parameter in rollout.policy.parameters() if parameter.requires_grad]
+        if list(map(id, trainable)) != list(map(id, self.trainable)):
+            self.trainable = trainable
+            first = th.arange(1)
+            actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
+            log_prob, _ = log_prob_and_entropy(rollout.policy, take(flatten(rollout.observations), first), actions)
+            depends = depends_on(log_prob, trainable)
+            self.parameters = [parameter for parameter, used in zip(trainable, depends, strict=True) if used]
+        return self.parameters
 
     def cosine(self) -> dict[str, float]:
         """The cosine between the last two updates, if there have been two."""
@@ -107,7 +126,7 @@ class GradientQualityCallback(BaseCallback):
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
         if n_episodes < 2:
             return {}
-        weights = {"": training_weights(cast(REINFORCE, self.model)) * rollout.discounts}
+        weights = {"": training_weights(cast(REINFORCE, self.model))}
         rollout = evenly_spread(rollout, self.max_episodes)
         for name, function in self.functions.items():
             baseline = th.as_tensor(check_baseline(function(rollout), rollout))
