@@ -8,16 +8,15 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import flatten, take, to_vector
+from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import Parameters, depends_on, log_prob_and_entropy
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -69,7 +68,6 @@ class GradientQualityCallback(BaseCallback):
             self.last_model = self.model
             self.n_rollouts = 0
             self.thetas: list[th.Tensor] = []
-            self.trainable: Parameters = []
         if isinstance(self.model, FiniteDifference):
             return
         check_model(self.model)
@@ -82,36 +80,27 @@ class GradientQualityCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         model = self.model
         self.n_rollouts += 1
-        is_due = self.n_rollouts % self.every == 0
+        n_left = -self.n_rollouts % self.every
+        if n_left > 2:
+            # A cosine needs the parameters before the last three updates
+            return
         figures: dict[str, float] = {}
         if isinstance(model, FiniteDifference):
             theta = model.theta
         else:
             rollout = cast(Rollout, cast(REINFORCE, model).rollout)
-            parameters = self.actor_parameters(rollout)
-            if not parameters:
+            try:
+                theta = to_vector(scored_parameters(rollout))
+            except ValueError:
                 # The actor is frozen
                 return
-            theta = to_vector(parameters)
-            figures = self.measure(rollout) if is_due else {}
+            figures = {} if n_left else self.measure(rollout)
         if self.thetas and self.thetas[-1].shape != theta.shape:
             self.thetas = []
         self.thetas = [*self.thetas[-2:], theta]
-        if is_due:
+        if n_left == 0:
             for key, figure in (figures | self.cosine()).items():
                 self.logger.record(f"gradient/{key}", figure)
-
-    def actor_parameters(self, rollout: Rollout) -> Parameters:
-        """The trainable parameters that log π depends on."""
-        trainable = [parameter for parameter in rollout.policy.parameters() if parameter.requires_grad]
-        if list(map(id, trainable)) != list(map(id, self.trainable)):
-            self.trainable = trainable
-            first = th.arange(1)
-            actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
-            log_prob, _ = log_prob_and_entropy(rollout.policy, take(flatten(rollout.observations), first), actions)
-            depends = depends_on(log_prob, trainable)
-            self.parameters = [parameter for parameter, used in zip(trainable, depends, strict=True) if used]
-        return self.parameters
 
     def cosine(self) -> dict[str, float]:
         """The cosine between the last two updates, if there have been two."""
