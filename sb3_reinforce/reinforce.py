@@ -23,7 +23,7 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
-from sb3_reinforce.common.settings import REINFORCE_ARGUMENTS, check_learn, check_reinforce
+from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
@@ -75,7 +75,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
     :param vf_coef: Weight of the critic's squared error in the policy step, where a features extractor is shared
-    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None for no bound
+    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None or inf for no
+        bound
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Every environment starts anew and contributes
@@ -117,6 +118,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     _arguments = REINFORCE_ARGUMENTS
+    _own_argument = "reward_to_go"
+    _instead = INSTEAD_OF_PPO
 
     def __init__(
         self,

@@ -3,7 +3,9 @@
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 
@@ -40,3 +42,14 @@ def plain(state: Any) -> Any:
     if isinstance(state, (list, tuple)):
         return [plain(value) for value in state]
     return state.numpy().tobytes() if isinstance(state, th.Tensor) else repr(state)
+
+
+class Scaled(FlattenExtractor):
+    """A features extractor with code and a parameter of its own; a policy that shares it knows it by three names."""
+
+    def __init__(self, space: spaces.Space[Any]):
+        super().__init__(space)
+        self.scale = th.nn.Parameter(th.ones(self.features_dim))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.scale * super().forward(observations)

@@ -74,8 +74,9 @@ class PolicyActor:
 class NumpyActor:
     """Acts by NumPy, for a plain MLP on flat observations."""
 
-    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int):
+    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int, keep_outputs: bool):
         self.policy = policy
+        self.keep_outputs = keep_outputs
         self.shape = (n_envs, *(policy.action_space.shape or ()))
         self.forward = numpy_forward(layers, n_envs)
         self.sample = sampler_of(policy, n_envs)
@@ -97,7 +98,8 @@ class NumpyActor:
 
     def act(self, obs: Any) -> Acted:
         outputs = self.forward(obs)
-        self.outputs.append(outputs)
+        if self.keep_outputs:
+            self.outputs.append(outputs.copy())
         return self.sample(outputs).reshape(self.shape), None, None
 
     @th.no_grad()
@@ -125,10 +127,10 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
     return [tensor.data_ptr() for tensor in tensors]
 
 
-def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int) -> Actor:
-    """The fastest actor that acts as the policy would."""
+def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, keep_outputs: bool = True) -> Actor:
+    """The fastest actor that acts as the policy would; ``keep_outputs`` is for ``log_prob``."""
     if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
-        return NumpyActor(policy, route.actor, n_envs)
+        return NumpyActor(policy, route.actor, n_envs, keep_outputs)
     return PolicyActor(policy, route)
 
 
@@ -173,11 +175,11 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
 def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.ndarray]:
     """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
     noise = th.empty(n_envs, n_actions)
-    log_exponential = noise.numpy()
+    exponential = noise.numpy()
 
     def sample(logits: Floats) -> np.ndarray:
-        noise.exponential_().log_()
-        actions: np.ndarray = (logits - log_exponential).argmax(axis=1)
+        noise.exponential_()
+        actions: np.ndarray = (logits - np.log(exponential)).argmax(axis=1)
         return actions
 
     return sample

@@ -73,15 +73,6 @@ def test_regression_on_mirrored_perturbations_is_the_central_difference(seed: in
     th.testing.assert_close(mirrored, central_difference(utility, theta, deltas))
 
 
-def test_known_gradients() -> None:
-    two = th.tensor([2.0]).double()
-    square = central_difference(lambda x: (x**2).sum(-1), two, th.tensor([[0.1]]).double())
-    th.testing.assert_close(square, th.tensor([4.0]).double())
-    theta, deltas = normal(1, N, seed=0)[0], normal(2 * N, N, seed=1)
-    for estimator in (central_difference, lambda *args: regression_gradient(*args[:2], th.cat([args[2], -args[2]]))):
-        th.testing.assert_close(estimator(lambda x: -(x**2).sum(-1), theta, deltas), -2 * theta)
-
-
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(name: str) -> None:
     utility, slope = linear(0)
