@@ -205,6 +205,8 @@ def test_bias_is_told_where_theory_knows_it():
 def test_a_users_function_is_a_row_and_the_table_prints():
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10, called("half"))
     assert table.names == ["none", "half", "floor"]
+    assert set(table.legend) == {*table.columns[1:], "[a, b]"}
+    assert all(text in str(table) for text in table.legend.values())
     assert str(table).splitlines()[1].split() == ["baseline", "variance", "ratio", "snr", "bias", "seconds"]
     assert [record["baseline"] for record in table.to_records()] == table.names
     assert table.to_records()[1]["variance_low"] == table["half"].variance.low
