@@ -14,4 +14,4 @@ type:
 test:
 	python -m pytest
 
-check: format lint type test
+check: lint type test

@@ -8,14 +8,13 @@ same episodes, and the trace of the covariance of the episodes' gradients is pri
 """
 
 import argparse
-from dataclasses import replace
 
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.baselines import BASELINES, none
-from sb3_reinforce.estimation.scores import episode_gradients
+from sb3_reinforce.diagnostics import sample
+from sb3_reinforce.estimation import BASELINES, gradients_by_episode
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)
@@ -27,27 +26,11 @@ th.set_num_threads(1)
 env = make_vec_env("CartPole-v1", n_envs=8, seed=arguments.seed)
 model = REINFORCE("MlpPolicy", env, gae_lambda=0.95, seed=arguments.seed, device="cpu").learn(arguments.timesteps)
 
-batch = []
-
-
-def keep(rollout):
-    """A baseline of one's own: 0, and the rollout is kept."""
-    batch.append(rollout)
-    return none(rollout)
-
-
-sampler = REINFORCE("MlpPolicy", env, learning_rate=0.0, baseline=keep, n_episodes=arguments.episodes, device="cpu")
-sampler.set_parameters(model.get_parameters())
-sampler.learn(1)
-policy, rollout = sampler.policy, batch[0]
-with th.no_grad():
-    values = policy.predict_values(rollout.observations.flatten(0, 1)).reshape(rollout.returns.shape).double()
-rollout = replace(rollout, values=values)
-
+rollout = sample(model, arguments.episodes)
 traces = {}
 for name, baseline in BASELINES.items():
     weights = rollout.discounts * (rollout.returns - baseline(rollout))
-    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)])
+    (gradients,) = gradients_by_episode(rollout, weights)
     traces[name] = gradients.var(dim=0).sum().item()
 
 print(f"{'baseline':16s} {'trace of the covariance':>24s} {'of none':>8s}")

@@ -15,8 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import CandidateUtility, gradients_by_episode, landscape, sample
 from sb3_reinforce.diagnostics.plots import plot_landscape
-from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.estimation.estimators import regression_gradient
+from sb3_reinforce.estimation import BASELINES, regression_gradient
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)

@@ -17,7 +17,7 @@ import torch as th
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_baselines, gradient_statistics, gradients_by_episode, sample
-from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation import BASELINES
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)

@@ -16,9 +16,7 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import check_function
-from sb3_reinforce.common.base import BasePolicyGradient
-from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
@@ -39,10 +37,7 @@ from sb3_reinforce.estimation.perturbations import (
 )
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.policies.plain_mlp import plain_actor
-from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
-from sb3_reinforce.sampling.normalization import frozen
-from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
+from sb3_reinforce.sampling.utility import Stopped, episodic_utility
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -82,7 +77,7 @@ class FiniteDifference(BasePolicyGradient):
     :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
         ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``
     :param deterministic: Whether candidates take their most likely actions, or sample
-    :param max_grad_norm: Bound on the norm of a step's gradient; None for no bound
+    :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
     :param max_episode_steps: The length beyond which an episode counts as one that never ends
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
@@ -103,8 +98,10 @@ class FiniteDifference(BasePolicyGradient):
     }
     policy: ActorCriticPolicy
     _arguments = FINITE_DIFFERENCE_ARGUMENTS
+    _own_argument = "standardize_utilities"
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
+    _maybe_recommend_cpu = cast(Any, OnPolicyAlgorithm._maybe_recommend_cpu)
 
     def __init__(
         self,
@@ -169,6 +166,8 @@ class FiniteDifference(BasePolicyGradient):
         policy_class = cast(type[ActorCriticPolicy], self.policy_class)
         policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
         self.policy = policy.to(self.device)
+        if policy_class in (ActorCriticPolicy, LinearPolicy):
+            self._maybe_recommend_cpu(policy_class.__name__)
         n_parameters = self.n_parameters
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, n_parameters)
@@ -216,7 +215,7 @@ class FiniteDifference(BasePolicyGradient):
         :param callback: Called at each step of the environments; ``model.policy`` is then the centre θ
         :param log_interval: Updates between two entries of the log; None for no log
         :param tb_log_name: The name of the run for tensorboard
-        :param reset_num_timesteps: Whether to begin the count of steps, and the episodes, anew
+        :param reset_num_timesteps: Whether to start the counts of steps and episodes from zero
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
@@ -226,7 +225,7 @@ class FiniteDifference(BasePolicyGradient):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._announce_search()
+        self._warn_of_few_perturbations()
         callback.on_training_start(locals(), globals())
         iteration = 0
         while self.num_timesteps < total_timesteps:
@@ -242,16 +241,15 @@ class FiniteDifference(BasePolicyGradient):
         callback.on_training_end()
         return self
 
-    def _announce_search(self) -> None:
-        """Say what makes this search slow or its gradient rough."""
-        if self.verbose >= 1 and plain_actor(self.policy) is None:
-            print(f"{type(self.policy).__name__} is not a plain MLP: candidates act one by one, which is slower")
-        if self.estimator == "regression" and cast(int, self.n_delta) <= self.n_parameters and not self._warned:
+    def _warn_of_few_perturbations(self) -> None:
+        """Warn once if a regression has more unknowns than perturbations."""
+        n = self.n_parameters
+        n_delta = cast(int, self.n_delta)
+        if self.estimator == "regression" and n_delta <= n and not self._warned:
             self._warned = True
             warnings.warn(
-                f"n_delta={self.n_delta} perturbations do not determine the gradient of {self.n_parameters} parameters "
-                "and an intercept: the regression returns the one of least norm. Raise n_delta, or search fewer "
-                "parameters",
+                f"n_delta={n_delta} perturbations do not determine the gradient of {n} parameters and an intercept: "
+                "the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
                 stacklevel=4,
             )
 
@@ -264,25 +262,23 @@ class FiniteDifference(BasePolicyGradient):
         :raises Stopped: If the callback returns False
         :raises ValueError: As ``learn``
         """
+        callback.on_rollout_start()
         self.is_collecting = True
         try:
-            callback.on_rollout_start()
             searched = self._find_parameters()
             theta = parameters.read(searched)
-            delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
             n = len(theta)
             n_delta = cast(int, self.n_delta)
             generator = cast(th.Generator, self._generator)
-            perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
-            deltas = delta_std * check_deltas(perturbation(n_delta, n, generator), n_delta, n)
-            estimator = check_function("estimator", self.estimator, ESTIMATORS)
+            delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
+            directions = self._function("perturbation", PERTURBATIONS)(n_delta, n, generator)
+            deltas = delta_std * check_deltas(directions, n_delta, n)
+            estimator = self._function("estimator", ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
-            actor = make_candidate_actor(self.policy, searched, self.n_envs, self.deterministic)
-            with frozen(self.get_vec_normalize_env()) as observed:
-                utility = EpisodicUtility(self, actor, n, callback, observed, first_seed)
+            with episodic_utility(self, searched, callback, first_seed) as utility:
                 gradient = check_estimate(estimator(utility, theta, deltas), n)
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
@@ -302,7 +298,9 @@ class FiniteDifference(BasePolicyGradient):
         :param estimate: What ``estimate_gradient`` returned
         :raises ValueError: If the step is not finite; the parameters are those before it
         """
-        gradient, searched, utilities = estimate.gradient, estimate.parameters, estimate.utilities
+        gradient = estimate.gradient
+        searched = estimate.parameters
+        utilities = estimate.utilities
         fit = fit_quality(estimate.candidates, utilities, gradient)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)

@@ -23,7 +23,7 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
-from sb3_reinforce.common.settings import REINFORCE_ARGUMENTS, check_learn, check_reinforce
+from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
@@ -55,15 +55,15 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     ``normalize_by``. With ``baseline="none"`` or ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``,
     ``discount_scores=True`` and no normalization or clipping, E[ĝ] is exactly ∇θ E[G_0].
 
-    What an unfinished episode is worth: with ``baseline="value"`` the critic's V is added at a time limit and where
-    ``n_steps`` cuts an episode. Without a critic a time limit counts as the end of the episode, and an episode that
-    ``n_steps`` cuts is left out: its return is not known. The value network is then never evaluated, except by a policy
+    Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
+    episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
+    left out, since its return is not known. The value network is then never evaluated, except by a policy
     that overrides ``forward``, ``evaluate_actions`` or ``extract_features``, and never used.
 
-    The critic has an optimizer of its own, of the policy's ``optimizer_class``, for the parameters that only V depends
-    on. A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's
-    passes, which would move the policy a second time, but by the one policy step, to whose loss the critic's squared
-    error is then added with weight ``vf_coef``.
+    The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
+    A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
+    which would move the policy a second time. The policy step trains it: ``vf_coef`` times the critic's squared error
+    is then part of its loss.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, or a class)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
@@ -75,11 +75,12 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
     :param vf_coef: Weight of the critic's squared error in the policy step, where a features extractor is shared
-    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None for no bound
+    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None or inf for no
+        bound
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
-    :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Every environment starts anew and contributes
-        a number of episodes fixed beforehand; steps beyond them are made, counted and not used
+    :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. All environments are reset, and each
+        contributes a number of episodes fixed beforehand; steps beyond them are made and counted, but not used
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
@@ -117,6 +118,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
     _arguments = REINFORCE_ARGUMENTS
+    _own_argument = "reward_to_go"
+    _instead = INSTEAD_OF_PPO
 
     def __init__(
         self,
@@ -431,7 +434,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param callback: Called at each step of the environments
         :param log_interval: Rollouts between two entries of the log; None for no log
         :param tb_log_name: The name of the run for tensorboard
-        :param reset_num_timesteps: Whether to begin the count of steps, and the episodes, anew
+        :param reset_num_timesteps: Whether to reset the count of steps and the environments
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
@@ -441,7 +444,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        # The first rollout is drawn at the temperature of the run's start, not at that of the end of the run before
+        # The first rollout has the temperature of the start, not the final one of an earlier run
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         return total_timesteps, callback
 

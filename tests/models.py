@@ -3,7 +3,9 @@
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 
@@ -36,3 +38,14 @@ def moved_by_learning(model: Any, total_timesteps: int) -> set[str]:
     before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
     model.learn(total_timesteps)
     return {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
+
+
+class Scaled(FlattenExtractor):
+    """A user's features extractor with a parameter, which a policy that shares it knows by three names."""
+
+    def __init__(self, space: spaces.Space[Any]):
+        super().__init__(space)
+        self.scale = th.nn.Parameter(th.ones(self.features_dim))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.scale * super().forward(observations)

@@ -206,3 +206,13 @@ def test_public_names_are_there_and_documented(module_name: str) -> None:
         if missing or not text:
             undocumented.append(f"{name}: {', '.join(missing) or 'no docstring'}")
     assert not undocumented, "\n".join(undocumented)
+
+
+@pytest.mark.parametrize("table", ["BASELINES", "ESTIMATORS", "PERTURBATIONS"])
+def test_every_named_function_is_in_the_readme_and_the_docstring(table: str) -> None:
+    """What else is due when one is added; CONTRIBUTING.md lists the rest."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    algorithm = sb3_reinforce.REINFORCE if table == "BASELINES" else sb3_reinforce.FiniteDifference
+    names = getattr(importlib.import_module("sb3_reinforce.estimation"), table)
+    missing = [name for name in names if f'`"{name}"`' not in readme or f'``"{name}"``' not in str(algorithm.__doc__)]
+    assert not missing

@@ -22,8 +22,7 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_reinforce import REINFORCE
-from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
+from sb3_reinforce import REINFORCE, GymnasiumVecEnv
 
 
 def dummy(n_envs: int) -> VecEnv:

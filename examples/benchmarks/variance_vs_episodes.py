@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import gradients_by_episode, sample
 from sb3_reinforce.diagnostics.plots import plot_variances
-from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation import BASELINES
 
 SIZES, N_GROUPS = (4, 8, 16, 32), 8
 

@@ -1,8 +1,9 @@
 """Checks of what a user passes in: each error names the argument, its value and what is allowed."""
 
+import difflib
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from numbers import Integral, Real
 from typing import Any, TypeAlias
@@ -24,17 +25,32 @@ def wrong_type(name: str, allowed: str, value: Any) -> TypeError:
     return TypeError(f"{name} must be {allowed}, got {value!r} of type {type(value).__name__}")
 
 
-def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, above: bool = False) -> float:
-    """Return a finite number in the range as a float; with ``above``, ``low`` itself is excluded."""
+def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> ValueError:
+    """Make the error for a name that is none of some, with the nearest one."""
+    known = {each.lower(): each for each in names}
+    near = difflib.get_close_matches(str(value).lower(), known, n=1, cutoff=0.7)
+    hint = f": did you mean {known[near[0]]!r}?" if near else ""
+    return ValueError(f"{name} must be {allowed} {', '.join(map(repr, known.values()))}, got {value!r}{hint}")
+
+
+def check_number(
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    above: bool = False,
+    finite: bool = True,
+) -> float:
+    """Return a number in the range as a float; with ``above``, ``low`` itself is excluded."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise wrong_type(name, "a number", value)
     number = float(value)
-    if not math.isfinite(number) or not low <= number <= high or (above and number == low):
+    if (finite and math.isinf(number)) or not low <= number <= high or (above and number == low):
         allowed = "finite"
         if high < math.inf:
             allowed = f"in {'(' if above else '['}{low:g}, {high:g}]"
         elif low > -math.inf:
-            allowed = f"finite and {'>' if above else '>='} {low:g}"
+            allowed = f"{'finite and ' if finite else ''}{'>' if above else '>='} {low:g}"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 
@@ -62,7 +78,7 @@ def check_flag(name: str, value: Any) -> bool:
 def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     """Return one of some names; the error lists them."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+        raise unknown_name(name, "one of", choices, value)
     return value
 
 
@@ -70,7 +86,7 @@ def check_function(name: str, value: Any, functions: Mapping[str, Callable[..., 
     """Return the user's own function, or one of ours by its name; the error lists the names."""
     function: Callable[..., Any] | None = value if callable(value) else functions.get(check_name(name, value))
     if function is None:
-        raise ValueError(f"{name} must be a callable or one of {', '.join(map(repr, functions))}, got {value!r}")
+        raise unknown_name(name, "a callable or one of", functions, value)
     return function
 
 
@@ -81,11 +97,10 @@ def check_name(name: str, value: Any) -> Any:
     return value
 
 
-def check_kind(name: str, value: Any, kinds: tuple[type, ...], optional: bool = True) -> Any:
-    """Return an instance of one of some types, or None if it is ``optional``."""
-    if not (isinstance(value, kinds) or (optional and value is None)):
-        names = [each.__name__ for each in kinds]
-        raise wrong_type(name, " or ".join([*names, "None"] if optional else names), value)
+def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> Any:
+    """Return an instance of one of some types."""
+    if not isinstance(value, kinds):
+        raise wrong_type(name, " or ".join(each.__name__ for each in kinds), value)
     return value
 
 
@@ -98,7 +113,7 @@ def check_subclass(name: str, value: Any, base: type) -> Any:
 
 def check_device(name: str, value: Any) -> Any:
     """Return a device that PyTorch knows, or "auto"."""
-    check_kind(name, value, (str, th.device), optional=False)
+    check_kind(name, value, (str, th.device))
     if value != "auto":
         try:
             th.device(value)
@@ -131,9 +146,9 @@ class CheckedSchedule(FloatSchedule):
         return self.check(f"{self.name} (at progress {progress_remaining:g})", value, above=above)
 
 
-def number(low: float = -math.inf, high: float = math.inf, above: bool = False) -> Check:
-    """Make a check for a finite number."""
-    return partial(check_number, low=low, high=high, above=above)
+def number(low: float = -math.inf, high: float = math.inf, above: bool = False, finite: bool = True) -> Check:
+    """Make a check for a number."""
+    return partial(check_number, low=low, high=high, above=above, finite=finite)
 
 
 def integer(low: int, high: int = sys.maxsize) -> Check:
@@ -148,7 +163,7 @@ def choice(*names: str) -> Check:
 
 def kind(*kinds: type) -> Check:
     """Make a check for an instance of some types."""
-    return partial(check_kind, kinds=kinds, optional=False)
+    return partial(check_kind, kinds=kinds)
 
 
 def schedule(low: float = 0.0, high: float = math.inf, above: bool = False) -> Check:

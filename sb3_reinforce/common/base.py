@@ -1,9 +1,9 @@
 """What both algorithms inherit: checked arguments, prediction, saving, loading and going on."""
 
-import pickle
-import random
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
+from inspect import signature
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,8 +14,9 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import ATTRIBUTES
+from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
+from sb3_reinforce.common.states import check_finite, generator_states, optimizer_mismatch, restore_generators
 from sb3_reinforce.common.storage import PathOrFile, atomic_write, check_archive
 
 __all__ = ["BasePolicyGradient", "uninterrupted"]
@@ -24,27 +25,40 @@ Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
 LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"}
+# What a state dict of either algorithm may have
+STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
 
 class BasePolicyGradient(BaseAlgorithm):
     """
     What both algorithms have in common besides the mathematics: saving and loading change everything or nothing.
 
-    ``_arguments`` are the checks of the constructor's arguments, which also build the schedules.
+    ``_arguments`` are the checks of the constructor's arguments, which also build the schedules; ``_own_argument`` is
+    one that no other algorithm saves; ``_instead`` says for arguments of other algorithms what to use.
     """
 
     _arguments: ClassVar[Mapping[str, Check]]
+    _own_argument: ClassVar[str]
+    _instead: ClassVar[Mapping[str, str]] = {}
     _random_state: bytes
+
+    def __new__(cls: type[Model], *args: Any, **kwargs: Any) -> Model:
+        # Where Python would only say that an argument is unexpected; a subclass may have it
+        accepted = {name for each in cls.__mro__ for name in signature(each.__init__).parameters}  # type: ignore[misc]
+        for name in kwargs.keys() & cls._instead.keys() - accepted:
+            raise TypeError(f"{cls.__name__} has no argument {name}: {cls._instead[name]}")
+        return super().__new__(cls)
 
     def __init__(self, policy: Any, env: Any, *, needs_env: bool, policy_kwargs: Any, verbose: int, **kwargs: Any):
         kwargs |= {"policy": policy, "policy_kwargs": policy_kwargs, "verbose": verbose}
         # Stable-Baselines3 uses some arguments as soon as it has them
         for name in kwargs.keys() & self._arguments.keys():
             self._arguments[name](name, kwargs[name])
+        check_policy_name(policy, self.policy_aliases)
         if needs_env or env is not None:
             env = check_env(env, verbose)
         if policy_kwargs is not None:
-            # Algorithms write to it
+            # Stable-Baselines3 writes to it
             kwargs["policy_kwargs"] = dict(policy_kwargs)
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)
@@ -104,10 +118,7 @@ class BasePolicyGradient(BaseAlgorithm):
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written
         """
-        device = th.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
-        states = random.getstate(), np.random.get_state(), th.get_rng_state(), device
-        # As bytes, since Stable-Baselines3 would print each of their numbers into the file
-        self._random_state = pickle.dumps(states)
+        self._random_state = generator_states(self.device)
         with atomic_write(path) as file:
             super().save(file, exclude, include)
 
@@ -138,6 +149,11 @@ class BasePolicyGradient(BaseAlgorithm):
         """
         check_flag("restore_random_state", restore_random_state)
         saved = check_archive(path, ("data", "policy.pth"))
+        if cls._own_argument not in saved:
+            raise ValueError(
+                f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
+                "call set_parameters with this path and exact_match=False"
+            )
         arguments = cls._arguments.keys() - ATTRIBUTES.keys()
         unknown = sorted(kwargs.keys() - arguments - saved - LOAD_ARGUMENTS)
         if unknown:
@@ -177,8 +193,9 @@ class BasePolicyGradient(BaseAlgorithm):
         From a file only tensors are read (``weights_only``): no code in it is run.
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
-        :param exact_match: Whether there must be a state for everything that has one here, and nothing else; if not,
-            what this model does not have, such as an optimizer for the critic, is left out
+        :param exact_match: Whether there must be a state for everything that has one here, and nothing else. If not,
+            some may be missing, FiniteDifference leaves out REINFORCE's ``critic_optimizer``, and the state of another
+            kind of optimizer is left out, with a warning
         :param device: Device on which the parameters are loaded
         :raises TypeError: If a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
@@ -190,18 +207,24 @@ class BasePolicyGradient(BaseAlgorithm):
             check_archive(states, ("policy.pth",))
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
         names = self._get_torch_save_params()[0]
-        if exact_match and states.keys() != set(names):
-            raise ValueError(f"load_path_or_dict must have {', '.join(names)}, got {', '.join(map(str, states))}")
+        allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
+        if not states.keys() <= allowed or (exact_match and len(states) < len(names)):
+            raise ValueError(
+                f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing "
+                f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
+            )
         own = {name: states[name] for name in names if name in states}
-        for name, state in own.items():
+        for name, state in list(own.items()):
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
             part = recursive_getattr(self, name)
-            if isinstance(part, th.optim.Optimizer) and (reason := mismatch(part, state)):
-                raise ValueError(
-                    f"load_path_or_dict[{name!r}] must be the state of a {type(part).__name__} for this policy, but "
-                    f"{reason}"
-                )
+            reason = optimizer_mismatch(part, state) if isinstance(part, th.optim.Optimizer) else ""
+            if reason:
+                needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
+                if exact_match:
+                    raise ValueError(f"{needed}, but {reason}")
+                del own[name]
+                warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=2)
         # A mask that a user's policy adds to its logits may well be infinite
         check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
@@ -210,54 +233,3 @@ class BasePolicyGradient(BaseAlgorithm):
         except BaseException:
             super().set_parameters(before, device=device)
             raise
-
-
-def restore_generators(states: bytes, device: th.device) -> None:
-    """Restore the states of the global random generators, the device's too."""
-    python, numpy, torch, cuda = pickle.loads(states)
-    random.setstate(python)
-    np.random.set_state(numpy)
-    th.set_rng_state(torch)
-    if cuda is not None and device.type == "cuda":
-        th.cuda.set_rng_state(cuda, device)
-
-
-def check_finite(states: Mapping[str, Any], infinite: set[str]) -> None:
-    """Check the numbers of nested states; those named by ``infinite`` may be infinite, but not NaN."""
-    for name, number in numbers("", states):
-        if th.isnan(number).any() or (name not in infinite and th.isinf(number).any()):
-            raise ValueError(f"load_path_or_dict must have finite numbers, got {number} for {name[1:]}")
-
-
-def numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
-    """Yield the tensors and floats of a nested state, each with its path."""
-    if isinstance(state, (th.Tensor, float)):
-        yield name, th.as_tensor(state)
-    elif isinstance(state, (Mapping, list, tuple)):
-        parts = state.items() if isinstance(state, Mapping) else enumerate(state)
-        for key, part in parts:
-            yield from numbers(f"{name}.{key}", part)
-
-
-def mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) -> str:
-    """Return why a state does not belong to this kind of optimizer and its parameters, "" if it does."""
-    own = optimizer.state_dict()
-    groups = state.get("param_groups", [])
-    if [len(group["params"]) for group in groups] != [len(group["params"]) for group in own["param_groups"]]:
-        return "it has other groups of parameters"
-    for setting, value in own["param_groups"][0].items():
-        for group in groups:
-            if setting not in group:
-                return f"it has no {setting}: it belongs to another optimizer"
-            if isinstance(value, (float, tuple)) and type(group[setting]) not in (type(value), list, int):
-                return f"its {setting} is {group[setting]!r}"
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for index, moments in state.get("state", {}).items():
-        shapes = {key: np.shape(value) for key, value in own["state"].get(index, {}).items()}
-        if not shapes and "fused" in optimizer.defaults:
-            # These optimizers go through moments and parameter side by side, and would write beyond shorter ones
-            shapes = dict.fromkeys(moments, tuple(parameters[index].shape))
-        for key, shape in shapes.items():
-            if key not in moments or np.shape(moments[key]) not in ((), shape):
-                return f"its {key} of parameter {index} must have shape {shape}, got {np.shape(moments.get(key))}"
-    return ""

@@ -25,6 +25,7 @@ from sb3_reinforce.common.arguments import (
     number,
     optional,
     schedule,
+    unknown_name,
     wrong_type,
 )
 
@@ -34,6 +35,26 @@ Functions = Mapping[str, Callable[..., Any]]
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
+STACK_FRAMES = "stack observations with VecFrameStack, or use RecurrentPPO of sb3-contrib"
+MASK_LOGITS = "mask the logits in a subclass of ActorCriticPolicy, or use MaskablePPO of sb3-contrib"
+CONTRIB_POLICIES = {
+    "MlpLstmPolicy": STACK_FRAMES,
+    "CnnLstmPolicy": STACK_FRAMES,
+    "MultiInputLstmPolicy": STACK_FRAMES,
+    "RecurrentActorCriticPolicy": STACK_FRAMES,
+    "MaskableActorCriticPolicy": MASK_LOGITS,
+}
+ONE_STEP = "it takes one policy step per rollout, which max_grad_norm alone bounds"
+OPTIMIZER = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
+# Arguments of PPO and A2C, and what REINFORCE has instead
+INSTEAD_OF_PPO = {
+    "n_epochs": "it takes one policy step per rollout; n_critic_updates is the number of the critic's passes",
+    "clip_range": ONE_STEP,
+    "clip_range_vf": ONE_STEP,
+    "target_kl": ONE_STEP,
+    "use_rms_prop": OPTIMIZER,
+    "rms_prop_eps": OPTIMIZER,
+}
 DEFAULT_N_STEPS = 32
 DEFAULT_N_EPISODES = 16
 
@@ -43,6 +64,18 @@ def check_policy(name: str, value: Any) -> Any:
     if not isinstance(value, (str, type)):
         raise wrong_type(name, "a name or a class", value)
     return value
+
+
+def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
+    """Check that the algorithm knows the name of a policy, or can train its class."""
+    if policy in known or policy in known.values():
+        return
+    names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
+    for name, remedy in CONTRIB_POLICIES.items():
+        if name in names:
+            raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {remedy}")
+    if isinstance(policy, str):
+        raise unknown_name("policy", "a class or one of", known, policy)
 
 
 def check_callback(name: str, value: Any) -> Any:
@@ -57,7 +90,8 @@ def check_callback(name: str, value: Any) -> Any:
 COMMON_ARGUMENTS: dict[str, Check] = {
     "policy": check_policy,
     "learning_rate": schedule(high=MAX_LEARNING_RATE),
-    "max_grad_norm": optional(number(0, above=True)),
+    # SB3 users also write inf for no clipping
+    "max_grad_norm": optional(number(0, above=True, finite=False)),
     "max_episode_steps": integer(1),
     "stats_window_size": integer(1),
     "tensorboard_log": optional(kind(str, os.PathLike)),

@@ -81,7 +81,16 @@ def compare_baselines(
     counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
     with seeded(model.policy, seed):
         rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
-    return Table(f"Gradient of one episode by baseline ({n_episodes} episodes; floor: of constants)", rows)
+    legend = {
+        "variance": "trace of the covariance of the gradient of one episode",
+        "ratio": f"variance / variance of {reference!r}, on the same resamples",
+        "snr": "squared norm of the expected gradient / variance; an interval that includes 0: no signal detected",
+        "bias": "relative to the gradient, where it is known in theory",
+        "seconds": "time to compute the baseline",
+        "[a, b]": f"{confidence:.0%} bootstrap interval; -: not known",
+    }
+    title = f"Gradient of one episode by baseline ({n_episodes} episodes; floor = best constant per component)"
+    return Table(title, rows, legend)
 
 
 def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -> dict[str, Baseline]:
@@ -135,7 +144,7 @@ def baseline_rows(
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
-    """``‖E g − E g_none‖ / ‖E g_none‖``: 0, 1/N if each of N returns is part of its own mean, or NaN if unknown."""
+    """``‖E g − E g_none‖ / ‖E g_none‖``: 0, 1/N if each of N returns is in its mean, or NaN if unknown."""
     if baseline in [BASELINES[name] for name in ("none", "leave_one_out", "value", "optimal")]:
         return 0.0
     lengths = th.unique(rollout.episodes[rollout.used], return_counts=True)[1]

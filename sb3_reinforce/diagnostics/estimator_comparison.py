@@ -116,7 +116,14 @@ def compare_estimators(
             to_reference, snr = judge(gradients, reference, n_resamples, confidence, seed)
             snr_per_step = Estimate(snr.value / steps, snr.low / steps, snr.high / steps)
             rows.append(EstimatorRow(name, to_reference, snr_per_step, steps, seconds))
-    return Table(f"Gradient of U(θ) for {n_parameters} parameters by estimator", rows)
+    legend = {
+        "cosine": "of the expected estimate to the likelihood-ratio gradient of other episodes",
+        "snr_per_step": "signal-to-noise ratio of an estimate / its steps; negative: not distinguishable from 0",
+        "steps": "environment steps of one estimate",
+        "seconds": "time for one estimate",
+        "[a, b]": f"{confidence:.0%} bootstrap interval; -: not known",
+    }
+    return Table(f"Gradient of U(θ) for {n_parameters} parameters by estimator", rows, legend)
 
 
 def judge(

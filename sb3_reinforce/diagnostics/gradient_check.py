@@ -1,6 +1,6 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
 from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
 
 Infos = list[list[dict[str, Any]]]
@@ -101,7 +102,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
         CheckRow(check, errors[check], allowed, bool(errors[check] <= allowed), meaning)
         for check, (allowed, meaning) in CHECKS.items()
     ]
-    return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows)
+    legend = {"error": "how far the two sides of `meaning` are apart", "passed": "whether error <= allowed"}
+    return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows, legend)
 
 
 def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
@@ -163,15 +165,15 @@ def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """``‖w − (G − b)‖ / ‖w‖`` over the used steps, where w is what training reads from the rollout buffer."""
+    """``‖w − (G − b)‖ / ‖w‖`` over the used steps, where training reads w from the rollout buffer."""
     baseline = check_function("baseline", collector.baseline, BASELINES)
     expected = (rollout.returns - baseline(rollout).cpu()) * rollout.used
-    return relative_difference(training_weights(collector), expected)
+    return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
 
 
 def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """The step of ``train()``, without entropy bonus and clipping, against ``Σ_t w_t γ^t ∇ log π / denominator``."""
-    gradients = gradients_by_episode(rollout, training_weights(collector) * rollout.discounts)[0]
+    """The step of ``train()``, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π / denominator``."""
+    gradients = gradients_by_episode(rollout, training_weights(collector))[0]
     expected = gradients.sum(0) / rollout.denominator
     parameters = scored_parameters(rollout)
     before = to_vector(parameters)
@@ -179,9 +181,8 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
     collector.lr_schedule = FloatSchedule(rate)
-    # No critic is trained now
-    collector.baseline = "none"
-    collector.normalize_advantage = False
+    # Without values no critic is trained
+    collector.rollout = replace(rollout, values=None)
     collector.ent_coef = 0.0
     collector.max_grad_norm = None  # type: ignore[assignment]
     collector.min_std = 0.0

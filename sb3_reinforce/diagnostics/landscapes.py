@@ -11,10 +11,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.common.arguments import check_integer, check_number
-from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.diagnostics.sampling import env_of, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
-from sb3_reinforce.policies.parameters import actor_parameters
+from sb3_reinforce.policies.parameters import actor_parameters, read
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
 from sb3_reinforce.sampling.measurement import undisturbed
@@ -43,10 +42,8 @@ class CandidateUtility:
         self.seed = check_integer("seed", seed, 0)
         self.n_steps = 0
         policy = cast(ActorCriticPolicy, model.policy)
-        training = policy.training
         self.parameters = actor_parameters(policy)
-        policy.set_training_mode(training)
-        self.theta = to_vector(self.parameters).to("cpu", th.float64)
+        self.theta = read(self.parameters)
         self.actor = make_candidate_actor(policy, self.parameters, self.env.num_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:

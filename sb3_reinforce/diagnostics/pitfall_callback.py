@@ -8,20 +8,23 @@ from typing import Any, cast
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import TensorOrDict, select, take, to_vector
-from sb3_reinforce.diagnostics.pitfalls import PITFALLS, History, Update
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update
 from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import scored_parameters
-from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature
+from sb3_reinforce.policies.plain_mlp import temperature_hooks
 from sb3_reinforce.reinforce import REINFORCE
 
 
 class PitfallCallback(BaseCallback):
     """
     Warns once about each of eight known pitfalls of the policy gradient, and names the argument to change.
+
+    Of several pitfalls with one cause only the cause is reported.
 
     The pitfalls are those of ``pitfalls.PITFALLS``: a learning rate that is too large, returns that are not scaled, too
     few episodes, the total return, gradients that spike without clipping, a critic that explains nothing, a policy that
@@ -52,7 +55,6 @@ class PitfallCallback(BaseCallback):
             self.updates: deque[Update] = deque(maxlen=50)
             self.n_updates = 0
             self.rollout: Rollout | None = None
-            self.parameters: Parameters = []
 
     def _on_training_start(self) -> None:
         self.total_timesteps: int = self.locals["total_timesteps"]
@@ -63,12 +65,15 @@ class PitfallCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         model = cast(REINFORCE, self.model)
         rollout = self.rollout = cast(Rollout, model.rollout)
-        self.parameters = self.parameters or scored_parameters(rollout)
+        self.temperature = temperature_of(model.policy)
         log_prob = self.log_prob(rollout)
-        weights = self.first(training_weights(model) * rollout.discounts, rollout).to(log_prob)
-        gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), self.parameters))
         self.log_prob_before = log_prob.detach()
-        self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
+        self.gradient = th.zeros(0)
+        if log_prob.requires_grad:
+            parameters = [parameter for parameter in model.policy.parameters() if parameter.requires_grad]
+            weights = self.first(training_weights(model), rollout).to(log_prob)
+            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
+            self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
 
     def _on_rollout_start(self) -> None:
         self.examine()
@@ -108,16 +113,22 @@ class PitfallCallback(BaseCallback):
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.total_timesteps)
         history = History(cast(REINFORCE, self.model), list(self.updates), self.n_updates, progress_remaining)
         for name, pitfall in PITFALLS.items():
-            sentence = pitfall(history) if name not in self.found else None
+            is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
+            sentence = None if name in self.found or is_explained else pitfall(history)
             if sentence is not None:
                 self.found[name] = sentence
                 warnings.warn(sentence, stacklevel=2)
 
+    @th.no_grad()
     def update(self, rollout: Rollout) -> Update:
         """What is known of the last update, which was computed from this rollout."""
         logged = self.logger.name_to_value
         used = rollout.used
+        present = temperature_of(rollout.policy)
+        # A falling temperature changes log π too, whatever the step
+        set_temperature(rollout.policy, self.temperature)
         change = self.log_prob_before - self.log_prob(rollout).detach()
+        set_temperature(rollout.policy, present)
         return Update(
             kl=float(change.mean()),
             entropy=-logged.get("train/entropy_loss", math.nan),
@@ -130,4 +141,12 @@ class PitfallCallback(BaseCallback):
             n_episodes=len(th.unique(rollout.episodes[used])),
             n_steps=int(used.sum()),
             used_fraction=float(used.double().mean()),
+            temperature=self.temperature,
         )
+
+
+def temperature_of(policy: ActorCriticPolicy) -> float:
+    """The temperature at which a policy acts."""
+    layer = getattr(policy, "action_net", None)
+    hooks = temperature_hooks(layer) if layer is not None else []
+    return float(hooks[0].temperature) if hooks else 1.0

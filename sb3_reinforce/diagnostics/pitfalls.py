@@ -23,17 +23,18 @@ from sb3_reinforce.reinforce import REINFORCE
 class Update:
     """What is known of one update; NaN for what is not known."""
 
-    kl: float  # mean of log π_old − log π_new over steps of the rollout
+    kl: float  # mean of log π_old − log π_new over steps of the rollout, at its temperature
     entropy: float  # mean entropy of the policy
     std: float  # mean standard deviation of the actions of a Gaussian policy
     grad_norm: float  # before clipping
     explained_variance: float  # of the critic
-    gradient: th.Tensor  # some components, shape (c,)
+    gradient: th.Tensor  # some components, shape (c,); none if the actor is frozen
     return_scale: float  # root mean square of the returns
     return_std: float
     n_episodes: int  # parts of episodes count
     n_steps: int  # steps used
     used_fraction: float  # share of the steps that were used
+    temperature: float = 1.0  # of the rollout
 
     @property
     def has_returns_to_explain(self) -> bool:
@@ -57,11 +58,14 @@ Pitfall: TypeAlias = Callable[[History], str | None]
 def rate_too_large(history: History) -> str | None:
     """
     A KL divergence above 1 in one update, a median above 0.1 over ten, or a loss of more than half of the randomness
-    within ten.
+    within ten, which a falling temperature may explain.
     """
     updates = history.updates[-10:]
     space = history.model.action_space
     steps = [update.kl for update in updates]
+    if history.progress_remaining > 0.5 and randomness(space, updates[0]) < 0.05:
+        # Without randomness any rate is too large: see deterministic_too_early
+        return None
     remedy = f"Lower the learning rate, now {history.model.lr_schedule(history.progress_remaining):.2g}"
     if steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1):
         return (
@@ -69,7 +73,7 @@ def rate_too_large(history: History) -> str | None:
             f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let learning_rate decay"
         )
     before, after = randomness(space, updates[0]), randomness(space, updates[-1])
-    if before - after > 0.5:
+    if before - after > 0.5 and updates[-1].temperature > 0.9 * updates[0].temperature:
         return (
             f"The entropy collapses: within {len(steps)} updates the policy went from {before:.0%} to {after:.0%} of "
             f"the randomness that it could have. {remedy} (learning_rate), or raise ent_coef"
@@ -96,16 +100,20 @@ def too_few_episodes(history: History) -> str | None:
     """
     n_episodes = fmean(update.n_episodes for update in history.updates)
     n_steps = fmean(update.n_steps for update in history.updates)
-    if len(history.updates) < 50 or (n_episodes >= 8 and n_steps >= 64):
+    # Parameters may be frozen or unfrozen on the way, and then gradients are not comparable
+    gradients = [update.gradient for update in history.updates]
+    is_comparable = len(gradients[-1]) > 0 and all(each.shape == gradients[-1].shape for each in gradients)
+    if len(gradients) < 50 or not is_comparable or (n_episodes >= 8 and n_steps >= 64):
         return None
-    gradients = th.stack([update.gradient for update in history.updates])
-    ratio = float(signal_to_noise(compute_moments(gram(gradients), th.ones(1, len(gradients), dtype=th.float64))))
+    matrix = gram(th.stack(gradients))
+    ratio = float(signal_to_noise(compute_moments(matrix, th.ones(1, len(matrix), dtype=th.float64))))
     if ratio < 0.1 or math.isnan(ratio):
         argument = "n_episodes" if history.model.n_steps is None else "n_steps, or the number of environments"
+        shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "
-            f"{ratio:.2g}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}: 20 "
-            "episodes or more are usual"
+            f"{shown}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}: 20 episodes "
+            "or more are usual"
         )
     return None
 
@@ -150,7 +158,7 @@ def deterministic_too_early(history: History) -> str | None:
     left = history.progress_remaining
     share = randomness(space, history.updates[-1])
     if left > 0.5 and share < 0.05:
-        remedy = "raise temperature"
+        remedy = f"raise temperature (now {history.updates[-1].temperature:.2g})"
         if isinstance(space, spaces.Box):
             remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
         ent_coef: Any = history.model.ent_coef
@@ -197,4 +205,11 @@ PITFALLS: dict[str, Pitfall] = {
     "useless_critic": useless_critic,
     "deterministic_too_early": deterministic_too_early,
     "cut_episodes": cut_episodes,
+}
+
+# A pitfall that one of these explains is not reported after it
+CAUSES = {
+    "deterministic_too_early": {"rate_too_large"},
+    "too_few_episodes": {"rate_too_large", "deterministic_too_early"},
+    "useless_critic": {"unscaled_returns"},
 }

@@ -35,17 +35,19 @@ ON_LANDSCAPE = ("#FFFFFF", "#D55E00", "#CC79A7", "#000000", "#E69F00")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
-def new_axes(ax: Axes | None) -> Axes:
+def new_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 4.0)) -> Axes:
     """The Axes to draw on, new ones for None."""
     if ax is not None:
         return ax
-    axes: Axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")[1]
+    axes: Axes = plt.subplots(figsize=size, layout="constrained")[1]
     return axes
 
 
 def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     """
-    Plot the variance of the gradient of one episode for each baseline with its interval, and the floor as a line.
+    Plot the ratio of each baseline's variance to the reference's with its paired interval, and the floor as a line.
+
+    Hollow markers are baselines whose gradient is biased, or not known to be unbiased.
 
     :param table: The result of ``compare_baselines``
     :param ax: Axes to draw on; None for new ones
@@ -53,18 +55,22 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     """
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]
-    values = np.array([row.variance.value for row in rows])
-    ends = np.array([[row.variance.low for row in rows], [row.variance.high for row in rows]])
-    # No bars: on a logarithmic axis their lengths mean nothing
-    ax.hlines(range(len(rows)), *ends, color=COLOURS[0], linewidth=2)
-    ax.plot(values, range(len(rows)), linestyle="", marker=MARKERS[0], color=COLOURS[0])
+    for y, row in enumerate(rows):
+        fill = COLOURS[0] if row.bias == 0 else "white"
+        ax.hlines(y, row.ratio.low, row.ratio.high, color=COLOURS[0], linewidth=2)
+        ax.plot(row.ratio.value, y, linestyle="", marker=MARKERS[0], color=COLOURS[0], markerfacecolor=fill)
     ax.set_yticks(range(len(rows)), [row.baseline for row in rows])
-    ax.axvline(table["floor"].variance.value, color=COLOURS[3], linestyle="--", label="best constant per component")
+    ax.axvline(table["floor"].ratio.value, color=COLOURS[3], linestyle="--", label="floor")
+    ax.plot([], linestyle="", marker=MARKERS[0], color=COLOURS[0], label="unbiased")
+    ax.plot([], linestyle="", marker=MARKERS[0], color=COLOURS[0], markerfacecolor="white", label="biased, or unknown")
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
-    ax.set(xscale="log", xlabel="variance of one episode's gradient")
-    ax.set_title(table.title, wrap=True)
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), frameon=False)
+    ax.set_xlim(left=0)
+    # The ratio of the reference to itself is 1 in every resample
+    (reference, *_) = (row.baseline for row in rows if row.ratio.low == row.ratio.high == 1)
+    ax.set(xlabel=f"variance / variance of {reference}")
+    ax.set_title(table.title.replace(" (", "\n("))
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False)
     return ax
 
 
@@ -130,7 +136,7 @@ def plot_learning_curves(
         (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
     ax.set(xlabel="environment steps", ylabel="interquartile mean of the return")
-    ax.legend()
+    ax.legend(title=f"bands: {confidence:.0%} intervals")
     return ax
 
 
@@ -175,9 +181,10 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
     """
-    ax = new_axes(ax)
-    colours = ax.contourf(scape.scales, scape.scales, scape.utilities, levels=20, cmap="viridis")
-    ax.figure.colorbar(colours, ax=ax, label="U(θ)")
+    ax = new_axes(ax, (5.2, 4.8))
+    # Interpolated between the points, where contours of noisy utilities would be ragged
+    colours = ax.pcolormesh(scape.scales, scape.scales, scape.utilities, shading="gouraud", cmap="viridis")
+    ax.figure.colorbar(colours, ax=ax, label="U(θ), mean return of an episode")
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
     for index, (name, (x, y)) in enumerate(scape.steps.items()):
         ax.quiver(
@@ -191,7 +198,9 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
             width=0.015,
             label=name,
         )
-    ax.set(xlabel="first direction", ylabel="second direction", aspect="equal")
+    limits = (scape.scales[0], scape.scales[-1])
+    ax.set(xlim=limits, ylim=limits, xlabel="first direction", ylabel="second direction", aspect="equal")
+    ax.set_title("Utility on a plane through θ (the dot)")
     if scape.steps:
-        ax.legend(loc="lower left", fontsize="small", facecolor="0.85")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, fontsize="small", facecolor="0.85")
     return ax

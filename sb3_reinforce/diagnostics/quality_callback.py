@@ -17,7 +17,6 @@ from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import Parameters
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -37,10 +36,10 @@ class GradientQualityCallback(BaseCallback):
     estimate itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
-    rollout and are noisy if it has few episodes; with fewer than two nothing is logged. A measurement costs about one
-    forward and 1 + (number of baselines) backward passes over at most ``max_episodes`` episodes, two more with
-    ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for it, and training is the
-    same with and without it.
+    rollout and are noisy if it has few episodes; with fewer than two, or while the actor is frozen, nothing is logged.
+    A measurement costs about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes``
+    episodes, two more with ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for
+    it, and training is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
@@ -69,7 +68,6 @@ class GradientQualityCallback(BaseCallback):
             self.last_model = self.model
             self.n_rollouts = 0
             self.thetas: list[th.Tensor] = []
-            self.parameters: Parameters = []
         if isinstance(self.model, FiniteDifference):
             return
         check_model(self.model)
@@ -81,17 +79,27 @@ class GradientQualityCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model = self.model
+        self.n_rollouts += 1
+        n_left = -self.n_rollouts % self.every
+        if n_left > 2:
+            # A cosine needs the parameters before the last three updates
+            return
+        figures: dict[str, float] = {}
         if isinstance(model, FiniteDifference):
             theta = model.theta
         else:
             rollout = cast(Rollout, cast(REINFORCE, model).rollout)
-            self.parameters = self.parameters or scored_parameters(rollout)
-            theta = to_vector(self.parameters)
+            try:
+                theta = to_vector(scored_parameters(rollout))
+            except ValueError:
+                # The actor is frozen
+                return
+            figures = {} if n_left else self.measure(rollout)
+        if self.thetas and self.thetas[-1].shape != theta.shape:
+            self.thetas = []
         self.thetas = [*self.thetas[-2:], theta]
-        self.n_rollouts += 1
-        if self.n_rollouts % self.every == 0:
-            figures = self.cosine() if isinstance(model, FiniteDifference) else self.cosine() | self.measure(rollout)
-            for key, figure in figures.items():
+        if n_left == 0:
+            for key, figure in (figures | self.cosine()).items():
                 self.logger.record(f"gradient/{key}", figure)
 
     def cosine(self) -> dict[str, float]:
@@ -107,7 +115,7 @@ class GradientQualityCallback(BaseCallback):
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
         if n_episodes < 2:
             return {}
-        weights = {"": training_weights(cast(REINFORCE, self.model)) * rollout.discounts}
+        weights = {"": training_weights(cast(REINFORCE, self.model))}
         rollout = evenly_spread(rollout, self.max_episodes)
         for name, function in self.functions.items():
             baseline = th.as_tensor(check_baseline(function(rollout), rollout))

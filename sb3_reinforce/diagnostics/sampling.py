@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.weights import compute_weights
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
@@ -101,5 +102,12 @@ def check_independent(model: BaseAlgorithm) -> None:
 
 
 def training_weights(model: REINFORCE) -> th.Tensor:
-    """G_t − b_t as training reads it from the rollout buffer, shape ``(n_steps, n_envs)``, float64."""
-    return th.as_tensor(by_step(model.rollout_buffer)[0]).double()
+    """
+    The weights of the scores in ``train()``: γ^t (G_t − b_t), normalized if the model does so, shape
+    ``(n_steps, n_envs)``, float64.
+    """
+    rollout = cast(Rollout, model.rollout)
+    advantages, _ = by_step(model.rollout_buffer)
+    weights = th.zeros_like(rollout.returns)
+    weights[rollout.used] = compute_weights(rollout, advantages, model.normalize_advantage).to(weights)
+    return weights

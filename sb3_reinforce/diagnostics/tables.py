@@ -1,6 +1,6 @@
 """Results as small tables of numbers with bootstrap intervals, found by name, printed, or exported to pandas."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Generic, TypeVar
 
@@ -54,11 +54,13 @@ class Table(Generic[Row]):
 
     :param title: What the table shows
     :param rows: The rows, at least one
+    :param legend: What columns mean, printed below the table
     """
 
-    def __init__(self, title: str, rows: list[Row]):
+    def __init__(self, title: str, rows: list[Row], legend: Mapping[str, str] | None = None):
         self.title = title
         self.rows = rows
+        self.legend = {} if legend is None else legend
         self.columns = [field.name for field in fields(rows[0])]  # type: ignore[arg-type]
 
     @property
@@ -83,7 +85,8 @@ class Table(Generic[Row]):
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells
         ]
-        return "\n".join([self.title, *lines])
+        width = max(map(len, self.legend), default=0)
+        return "\n".join([self.title, *lines, *(f"  {key.ljust(width)}  {text}" for key, text in self.legend.items())])
 
     def to_pandas(self) -> Any:
         """

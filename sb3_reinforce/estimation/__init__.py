@@ -1,15 +1,6 @@
 """The mathematics: returns, baselines, weights, scores, perturbations and finite differences, as pure functions."""
 
-from sb3_reinforce.estimation.baselines import (
-    BASELINES,
-    Baseline,
-    leave_one_out,
-    mean,
-    none,
-    optimal,
-    time_mean,
-    value,
-)
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline, leave_one_out, mean, none, optimal, time_mean, value
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
     Estimator,
@@ -20,14 +11,7 @@ from sb3_reinforce.estimation.estimators import (
     forward_difference,
     regression_gradient,
 )
-from sb3_reinforce.estimation.perturbations import (
-    PERTURBATIONS,
-    Perturbation,
-    coordinate,
-    gaussian,
-    rademacher,
-    sphere,
-)
+from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, coordinate, gaussian, rademacher, sphere
 from sb3_reinforce.estimation.returns import discounted_sum, lambda_return, reward_to_go, total_return
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode

@@ -7,7 +7,7 @@ Everything is float64, since differences of nearly equal numbers are taken.
 
 A utility maps candidates of shape ``(k, n)`` to ``(k,)``; it compares all of them with each other, so with common
 random numbers they all meet the same episodes. Candidates of shape ``(m, k, n)`` are compared within columns only, so
-that each of the k columns can meet episodes of its own; the result is of shape ``(m, k)``.
+that each of the k columns can have separate episodes; the result is of shape ``(m, k)``.
 """
 
 from collections.abc import Callable

@@ -16,7 +16,7 @@ Perturbation: TypeAlias = Callable[[int, int, th.Generator], th.Tensor]
 
 
 def new_generator() -> th.Generator:
-    """A source of randomness of its own, seeded by PyTorch's global one."""
+    """A separate generator, seeded by PyTorch's global one."""
     return th.Generator().manual_seed(int(th.randint(2**31, ())))
 
 

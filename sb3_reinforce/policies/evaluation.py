@@ -21,6 +21,7 @@ from sb3_reinforce.policies.plain_mlp import (
     overrides,
     plain_actor,
     plain_critic,
+    takes_vectors,
     temperature_hooks,
 )
 
@@ -76,6 +77,9 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
 
 def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.Module) -> th.Tensor:
     """The features of ``n`` observations by one of the policy's extractors, shape ``(n, features_dim)``."""
+    if isinstance(obs, th.Tensor) and takes_vectors(policy, extractor):
+        # The result of the line below, for a tenth of its price
+        return obs.flatten(1).float()
     return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
 
 

@@ -149,9 +149,10 @@ def is_plain_layer(layer: nn.Module) -> bool:
 
 
 def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
-    """Whether the features of a policy are its observations, flattened."""
+    """Whether the features of a policy are known to be its observations, flattened."""
     space = policy.observation_space
-    return isinstance(space, spaces.Box) and not is_image_space(space) and type(extractor) is FlattenExtractor
+    is_flat = isinstance(space, spaces.Box) and not is_image_space(space) and type(extractor) is FlattenExtractor
+    return is_flat and is_plain_extractor(extractor)
 
 
 def evaluate_layers(layers: list[nn.Module], x: th.Tensor) -> th.Tensor:
@@ -186,7 +187,7 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
     Plain layers as one function from ``n`` observations to outputs of shape ``(n, n_out)``.
 
     For a handful of observations modules take far longer than the arithmetic. Weights are views of the parameters, so
-    that changes in place count at once.
+    that changes in place count at once. The next call may overwrite the result.
     """
     operations: list[Callable[[Floats], Floats]] = []
     for layer in layers:
@@ -202,8 +203,7 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
         x: Floats = obs.reshape(n, -1).astype(np.float32, copy=False)
         for operation in operations:
             x = operation(x)
-        y: Floats = x / np.float32(hooks[0].temperature) if hooks else x.copy()
-        return y
+        return x / np.float32(hooks[0].temperature) if hooks else x
 
     return outputs
 

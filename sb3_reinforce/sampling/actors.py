@@ -5,7 +5,7 @@ Both take the same actions for the same seed, up to rounding: the first draws it
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
@@ -28,19 +28,6 @@ from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, nump
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
 
-class Actor(Protocol):
-    """What draws the actions of a rollout."""
-
-    def act(self, obs: Any) -> Acted:
-        """Draw actions for observations of ``n_envs`` environments."""
-
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
-        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
-
-    def is_current(self, policy: ActorCriticPolicy) -> bool:
-        """Whether the policy would still act as this actor does."""
-
-
 class PolicyActor:
     """Acts by the policy's own methods."""
 
@@ -51,6 +38,7 @@ class PolicyActor:
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
+        """Draw actions for observations of ``n_envs`` environments."""
         obs = obs_as_tensor(obs, self.policy.device)
         if not self.route.forward:
             actions = self.policy.get_distribution(obs).get_actions()
@@ -60,6 +48,7 @@ class PolicyActor:
 
     @th.no_grad()
     def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
+        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
         if self.route.forward:
             return None
         policy = self.policy
@@ -68,14 +57,16 @@ class PolicyActor:
         return evaluate(policy, self.route, obs, rows, with_values=False)[0].cpu().numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
+        """Whether the policy would still act as this actor does."""
         return policy is self.policy
 
 
 class NumpyActor:
     """Acts by NumPy, for a plain MLP on flat observations."""
 
-    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int):
+    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int, keep_outputs: bool):
         self.policy = policy
+        self.keep_outputs = keep_outputs
         self.shape = (n_envs, *(policy.action_space.shape or ()))
         self.forward = numpy_forward(layers, n_envs)
         self.sample = sampler_of(policy, n_envs)
@@ -97,7 +88,8 @@ class NumpyActor:
 
     def act(self, obs: Any) -> Acted:
         outputs = self.forward(obs)
-        self.outputs.append(outputs)
+        if self.keep_outputs:
+            self.outputs.append(outputs.copy())
         return self.sample(outputs).reshape(self.shape), None, None
 
     @th.no_grad()
@@ -116,6 +108,9 @@ class NumpyActor:
         )
 
 
+Actor: TypeAlias = PolicyActor | NumpyActor
+
+
 def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int]:
     """Where the parameters of an actor lie in memory."""
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
@@ -125,10 +120,10 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
     return [tensor.data_ptr() for tensor in tensors]
 
 
-def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int) -> Actor:
-    """The fastest actor that acts as the policy would."""
+def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, keep_outputs: bool = True) -> Actor:
+    """The fastest actor that acts as the policy would; ``keep_outputs`` is for ``log_prob``."""
     if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
-        return NumpyActor(policy, route.actor, n_envs)
+        return NumpyActor(policy, route.actor, n_envs, keep_outputs)
     return PolicyActor(policy, route)
 
 
@@ -173,11 +168,11 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
 def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.ndarray]:
     """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
     noise = th.empty(n_envs, n_actions)
-    log_exponential = noise.numpy()
+    exponential = noise.numpy()
 
     def sample(logits: Floats) -> np.ndarray:
-        noise.exponential_().log_()
-        actions: np.ndarray = (logits - log_exponential).argmax(axis=1)
+        noise.exponential_()
+        actions: np.ndarray = (logits - np.log(exponential)).argmax(axis=1)
         return actions
 
     return sample

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
+from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, temperature_hooks
 
@@ -47,14 +48,15 @@ class LoopActor(CandidateActor):
         self.policy = policy
         self.searched = searched
         self.deterministic = deterministic
-        self.thetas = parameters.read(searched).repeat(n_envs, 1)
+        # On the device and in the type of the parameters, which matters for large networks
+        self.thetas = to_vector(searched).repeat(n_envs, 1)
 
     def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
-        self.thetas[envs] = thetas
+        self.thetas[envs] = thetas.to(self.thetas)
 
     @uninterrupted
     def act(self, obs: Any) -> np.ndarray:
-        centre = parameters.read(self.searched)
+        centre = to_vector(self.searched)
         actions = []
         try:
             for i, theta in enumerate(self.thetas):

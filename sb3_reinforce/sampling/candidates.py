@@ -24,7 +24,8 @@ Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 UNCHANGED = "The policy is the one before this update."
 
 
-@dataclass(frozen=True)
+# Not frozen: one is made at each step, which would take three times as long
+@dataclass
 class CandidateStep:
     """One step of all environments; ``finished`` is True where an episode of a candidate ended."""
 
@@ -160,7 +161,7 @@ def start_episodes(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> 
                 env.env_method("reset", seed=seed, indices=envs)
             except NotImplementedError as error:
                 raise ValueError(
-                    "common_random_numbers=True needs env_method('reset', seed=...), which "
-                    f"{type(env.unwrapped).__name__} does not have: set common_random_numbers=False"
+                    "Candidates that are to start from the same seeds need env_method('reset', seed=...), which "
+                    f"{type(env.unwrapped).__name__} does not have here: set common_random_numbers=False"
                 ) from error
     return env.reset()

@@ -94,9 +94,9 @@ def collect(
     them.
     """
     policy = model.policy
-    actor = make_actor(policy, route, env.num_envs)
-    as_env_actions = env_actions_of(policy, env.num_envs)
     is_attached = has_callback(callback)
+    actor = make_actor(policy, route, env.num_envs, keep_outputs=is_attached)
+    as_env_actions = env_actions_of(policy, env.num_envs)
     quota = Quota(extent, env.num_envs)
     # A copy: some VecEnvs reuse the array of the dones
     starts = [np.array(model._last_episode_starts, dtype=bool)]

@@ -1,5 +1,7 @@
 """The utility of candidates by episodes, as an estimator of FiniteDifference asks for it."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -7,9 +9,9 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.estimation.estimators import check_candidates
-from sb3_reinforce.sampling.candidate_actors import CandidateActor
+from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
-from sb3_reinforce.sampling.normalization import ObservationStatistics
+from sb3_reinforce.sampling.normalization import ObservationStatistics, frozen
 
 
 class Stopped(Exception):
@@ -22,20 +24,21 @@ class EpisodicUtility:
     def __init__(
         self,
         model: Any,
-        actor: CandidateActor,
-        n_parameters: int,
+        searched: Sequence[th.nn.Parameter],
         callback: BaseCallback,
         observed: ObservationStatistics | None,
         first_seed: int,
     ):
         self.model = model
-        self.actor = actor
-        self.n_parameters = n_parameters
+        self.actor = make_candidate_actor(model.policy, searched, model.n_envs, model.deterministic)
+        self.n_parameters = sum(parameter.numel() for parameter in searched)
         self.callback = callback
         self.observed = observed
         self.first_seed = first_seed
         self.candidates: list[th.Tensor] = []
         self.values: list[th.Tensor] = []
+        if model.verbose >= 1 and model._n_updates == 0 and isinstance(self.actor, LoopActor):
+            print(f"{type(model.policy).__name__} is not a plain MLP: candidates act one by one, which is slower")
 
     def __call__(self, candidates: th.Tensor) -> th.Tensor:
         """The mean returns of candidates ``(k, n)``, or ``(m, k, n)`` if only those in one column share seeds."""
@@ -77,3 +80,12 @@ class EpisodicUtility:
             self.observed.vec_normalize.training = False
         if not go_on:
             raise Stopped
+
+
+@contextmanager
+def episodic_utility(
+    model: Any, searched: Sequence[th.nn.Parameter], callback: BaseCallback, first_seed: int
+) -> Iterator[EpisodicUtility]:
+    """The utility of one update, during which VecNormalize is frozen; its episodes begin with ``first_seed``."""
+    with frozen(model.get_vec_normalize_env()) as observed:
+        yield EpisodicUtility(model, searched, callback, observed, first_seed)

@@ -13,7 +13,7 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, make, moved_by_learning
+from models import KINDS, make, moved_by_learning, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import (
@@ -33,6 +33,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 all_kinds = pytest.mark.parametrize("kind", KINDS)
@@ -332,6 +333,56 @@ def test_a_policy_that_is_replaced_or_frozen_after_construction(kind):
     model.policy.mlp_extractor.requires_grad_(False)
     moved = moved_by_learning(model, 64)
     assert "action_net.weight" in moved and not any("mlp_extractor" in name for name in moved)
+
+
+@pytest.mark.parametrize("change", [{"n_episodes": 8}, {"baseline": "value"}], ids=str)
+def test_the_current_rollout_is_trained_on_with_the_arguments_it_was_collected_with(change):
+    """And what a callback sets at its end waits for the next one."""
+    ends, frozen = [], {"n_episodes": 4, "normalize_by": "episodes", "max_grad_norm": None, "seed": 0}
+    for values in ({}, change):
+        model = make("episodes", make_vec_env(lambda: Corridor((3, 4)), 2, seed=0), **frozen)
+        model.learn(1, callback=Record(lambda model, values=values: vars(model).update(values)))
+        ends.append(model.policy.state_dict())
+    assert plain(ends[0]) == plain(ends[1])
+    assert ("value_net.weight" in moved_by_learning(model, 1)) == ("baseline" in change)
+
+
+def test_a_critic_warms_up_while_the_actor_is_frozen():
+    """As A2C allows."""
+    model = make("steps")
+    for module in (model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        module.requires_grad_(False)
+    moved = moved_by_learning(model, 16)
+    assert "value_net.weight" in moved and all("value_net" in name for name in moved)
+    assert model.logger.name_to_value["train/grad_norm"] == 0
+
+
+class Exponential(th.nn.Module):
+    def forward(self, x):
+        return x.exp()
+
+
+def parametrize_log_std(policy):
+    th.nn.utils.parametrize.register_parametrization(policy, "log_std", Exponential())
+
+
+def share_log_std(policy):
+    policy.log_std = th.nn.Parameter(th.zeros(1))
+
+
+@pytest.mark.parametrize("change", [parametrize_log_std, share_log_std])
+def test_a_log_std_of_another_form(change):
+    class Changed(ActorCriticPolicy):
+        def _build(self, lr_schedule):
+            super()._build(lr_schedule)
+            change(self)
+            self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    env = make_vec_env(lambda: Corridor((3, 4), lambda t, action: float(t), spaces.Box(-1, 1, (2,))), 2, seed=0)
+    kwargs = {"optimizer_class": th.optim.SGD, "net_arch": [4]}
+    model = make("episodes", env, Changed, n_episodes=4, baseline="optimal", seed=0, policy_kwargs=kwargs).learn(40)
+    assert check_gradient(model).passed
+    assert compare_baselines(model, n_episodes=10)["optimal"].variance.value > 0
 
 
 class ConstantCritic(ActorCriticPolicy):

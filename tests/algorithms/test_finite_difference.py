@@ -1,5 +1,7 @@
 """FiniteDifference as an algorithm of Stable-Baselines3: counts, callbacks, going on, and what may go wrong."""
 
+import copy
+import pickle
 import warnings
 from collections import deque
 from functools import partial
@@ -11,6 +13,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
+from models import Scaled, plain
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CheckpointCallback,
@@ -26,6 +29,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_reinforce import FiniteDifference
+from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 from sb3_reinforce.estimation.estimators import GradientEstimate, central_difference
 
 SMALL: dict[str, Any] = dict(n_delta=3, estimator="central", seed=0, device="cpu")
@@ -205,13 +209,6 @@ def test_schedules_end_at_zero_and_never_below() -> None:
     assert 0.01 <= scales[-1] < scales[0] == 0.11
 
 
-def test_a_learning_rate_of_zero_leaves_theta_where_it_is() -> None:
-    model = make(learning_rate=0.0)
-    theta = model.theta
-    model.learn(200)
-    assert model._n_updates > 0 and th.equal(model.theta, theta)
-
-
 def test_common_random_numbers_reduce_the_variance_of_the_gradient() -> None:
     shared, own = (
         th.stack([estimate.gradient for estimate in estimates(50, n_delta=2, common_random_numbers=is_shared)])
@@ -288,6 +285,78 @@ def test_a_linear_policy_on_dicts() -> None:
         make(env)
 
 
+def test_a_features_extractor_of_the_user_is_searched_and_left_as_it_was() -> None:
+    model = make(Line(), "MlpPolicy", policy_kwargs=dict(features_extractor_class=Scaled), learning_rate=0.0)
+    before = plain(model.policy.state_dict())
+    for _ in range(2):
+        model.learn(20)
+        assert plain(model.policy.state_dict()) == before
+    assert any(parameter is model.policy.features_extractor.scale for parameter in model._find_parameters())
+
+
+class Freeze(BaseCallback):
+    """Freezes the hidden layers when the first rollout ends."""
+
+    def _on_rollout_end(self) -> None:
+        if not self.model._n_updates:
+            self.hidden = plain(self.model.policy.mlp_extractor.state_dict())
+            self.model.policy.mlp_extractor.requires_grad_(False)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_what_is_searched_is_what_is_trainable_when_an_update_begins() -> None:
+    model = make(Line(), "MlpPolicy")
+    n_parameters = model.n_parameters
+    model.policy.action_net.requires_grad_(False)
+    head = plain(model.policy.action_net.state_dict())
+    model.learn(12)
+    assert plain(model.policy.action_net.state_dict()) == head and model.n_parameters == n_parameters - 65
+    old, model.policy = model.policy, make(Line(), "MlpPolicy", seed=1).policy
+    states = [plain(policy.state_dict()) for policy in (old, model.policy)]
+    model.learn(12)
+    assert plain(old.state_dict()) == states[0] and plain(model.policy.state_dict()) != states[1]
+    assert model.n_parameters == n_parameters
+
+
+def test_what_a_callback_freezes_is_searched_for_the_last_time() -> None:
+    model, callback = make(Line(), "MlpPolicy"), Freeze()
+    model.learn(6, callback)
+    once = plain(model.policy.mlp_extractor.state_dict())
+    assert model._n_updates == 1 and once != callback.hidden
+    model.learn(6, callback, reset_num_timesteps=False)
+    assert model._n_updates == 2 and plain(model.policy.mlp_extractor.state_dict()) == once
+
+
+def test_a_model_can_be_copied_when_new_and_pickled_after_learning() -> None:
+    model = make(Line())
+    same = copy.deepcopy(model)
+    assert th.equal(model.learn(60).theta, same.learn(60).theta)
+    again = pickle.loads(pickle.dumps(model))
+    assert th.equal(model.learn(60).theta, again.learn(60).theta)
+
+
+def test_a_model_that_a_callback_saves_is_not_collecting(tmp_path: Any) -> None:
+    class Save(BaseCallback):
+        def _on_step(self) -> bool:
+            assert self.model.is_collecting
+            self.model.save(tmp_path / "model")
+            return True
+
+    model = make(Line()).learn(1, Save())
+    assert not model.is_collecting and not FiniteDifference.load(tmp_path / "model").is_collecting
+
+
+@pytest.mark.parametrize("estimator", ["central", "regression"])
+def test_a_vector_environment_with_workers_is_searched_as_one_without(estimator: str) -> None:
+    same_step = gym.vector.AutoresetMode.SAME_STEP
+    workers = GymnasiumVecEnv(gym.vector.AsyncVectorEnv([Line] * 2, autoreset_mode=same_step))
+    thetas = [make(env, estimator=estimator).learn(20).theta for env in (workers, make_vec_env(Line, 2))]
+    workers.close()
+    assert th.equal(*thetas)
+
+
 def test_frame_stack_over_normalize() -> None:
     env = VecFrameStack(VecNormalize(make_vec_env("CartPole-v1", 2)), 2)
     assert make(env).learn(200).num_timesteps >= 200
@@ -359,12 +428,6 @@ def test_what_a_user_returns_wrongly_is_named_and_theta_stays(kwargs: dict[str, 
     with pytest.raises(ValueError, match=match):
         model.learn(100)
     assert th.equal(model.theta, theta) and model._n_updates == 0
-
-
-def test_policy_kwargs_are_not_written_to() -> None:
-    policy_kwargs = dict(optimizer_class=th.optim.SGD)
-    make(policy_kwargs=policy_kwargs)
-    assert policy_kwargs == dict(optimizer_class=th.optim.SGD)
 
 
 @pytest.mark.slow

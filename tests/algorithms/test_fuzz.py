@@ -134,9 +134,8 @@ def assert_trains(algorithm, env, arguments):
         assert len(model.ep_info_buffer) == min(model._n_updates * model.n_episodes, 100)
     else:
         k = model.n_delta
-        n_candidates = {"regression": k, "forward": k + 1, "central": 2 * k}[model.estimator]
-        used = model._n_updates * n_candidates
-        assert len(model.ep_info_buffer) == min(used * model.n_eval_episodes, 100) <= n_episodes
+        n_candidates = model._n_updates * {"regression": k, "central": 2 * k, "forward": k + 1}[model.estimator]
+        assert len(model.ep_info_buffer) == min(n_candidates * model.n_eval_episodes, 100) <= n_episodes
 
 
 @fuzzed

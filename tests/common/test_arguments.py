@@ -1,5 +1,6 @@
 """Each argument is checked at construction, by load, by set_env and by learn; the error names it."""
 
+from contextlib import suppress
 from inspect import signature
 
 import gymnasium as gym
@@ -9,8 +10,10 @@ import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from models import KINDS, make
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
@@ -44,10 +47,12 @@ def wrong_values(check):
     values = list(WRONG[getattr(check, "func", check).__name__])
     if "low" in keywords:
         values += [keywords["low"] - 0.1, keywords["low"] - 1]
-    if "high" in keywords:
+    if keywords.get("high", INF) < INF:
         values.append(keywords["high"] * 1.1)
     if keywords.get("above"):
         values.append(keywords["low"])
+    if not keywords.get("finite", True):
+        values.remove(INF)
     return values
 
 
@@ -75,12 +80,29 @@ def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
     assert model._last_obs is None and model.num_timesteps == 0
 
 
+class RecurrentActorCriticPolicy(ActorCriticPolicy):
+    """Has the name of sb3-contrib's."""
+
+
+class MaskableActorCriticPolicy(ActorCriticPolicy):
+    """Has the name of sb3-contrib's."""
+
+
 @pytest.mark.parametrize(
     ("kind", "wrong", "words"),
     [
         ("steps", {"baseline": "average"}, ["baseline", "'average'", "'leave_one_out'", "'optimal'", "'time_mean'"]),
         ("search", {"estimator": "backward"}, ["estimator", "'backward'", "'central'"]),
         ("search", {"perturbation": "cube"}, ["perturbation", "'cube'", "'sphere'"]),
+        ("steps", {"baseline": "leave-one-out"}, ["'leave-one-out': did you mean 'leave_one_out'?"]),
+        ("search", {"estimator": "Central"}, ["'Central': did you mean 'central'?"]),
+        ("search", {"perturbation": "gausian"}, ["'gausian': did you mean 'gaussian'?"]),
+        ("steps", {"normalize_by": "step"}, ["'step': did you mean 'steps'?"]),
+        ("steps", {"policy": "MLPPolicy"}, ["policy", "'CnnPolicy'", "'MLPPolicy': did you mean 'MlpPolicy'?"]),
+        ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
+        ("steps", {"policy": "MlpLstmPolicy"}, ["policy", "recurrent", "MlpLstmPolicy", "VecFrameStack"]),
+        ("search", {"policy": RecurrentActorCriticPolicy}, ["policy", "recurrent", "VecFrameStack"]),
+        ("steps", {"policy": MaskableActorCriticPolicy}, ["policy", "masked", "logits", "MaskablePPO"]),
         ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
         ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
@@ -100,6 +122,40 @@ def test_arguments_that_do_not_go_together(kind, wrong, words):
     with pytest.raises((ValueError, TypeError)) as error:
         make(kind, **wrong)
     assert all(word in str(error.value) for word in words)
+
+
+@pytest.mark.parametrize("other", [A2C, PPO])
+def test_what_takes_the_place_of_arguments_of_other_algorithms_is_said(other):
+    names = signature(other).parameters.keys() - signature(REINFORCE).parameters.keys()
+    assert names
+    for name in names:
+        with pytest.raises(TypeError, match=f"REINFORCE has no argument {name}: "):
+            make("steps", **{name: 0.2})
+
+
+def test_a_subclass_may_have_arguments_of_other_algorithms():
+    class Clipped(REINFORCE):
+        def __init__(self, *args, clip_range, **kwargs):
+            super().__init__(*args, **kwargs)
+
+    class Own(Clipped):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+
+    assert isinstance(Own("MlpPolicy", "CartPole-v1", device="cpu", clip_range=0.2), REINFORCE)
+
+
+@both
+def test_an_infinite_gradient_norm_is_no_bound(kind):
+    without, infinite = (make(kind, seed=0, max_grad_norm=norm).learn(40) for norm in (None, INF))
+    assert all(map(th.equal, without.policy.parameters(), infinite.policy.parameters()))
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "LinearPolicy"])
+def test_the_search_recommends_the_cpu(policy):
+    # A device without a GPU, on which nothing can be computed after the warning
+    with pytest.warns(UserWarning, match=r"run FiniteDifference on the GPU.*device='cpu'"), suppress(RuntimeError):
+        make("search", policy=policy, policy_kwargs={}, device="meta")
 
 
 @pytest.mark.parametrize(

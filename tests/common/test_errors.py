@@ -5,7 +5,6 @@ import pytest
 import torch as th
 from environments import Corridor
 from models import make, plain
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
@@ -44,15 +43,6 @@ def assert_saveable_and_trainable(model, path):
     model.learn(64, reset_num_timesteps=False)
 
 
-def test_a_gradient_that_is_not_finite_is_refused(tmp_path):
-    model = REINFORCE("MlpPolicy", Corridor((7,), reward=lambda t, action: 1e38), n_steps=14, normalize_advantage=False)
-    before = parameters_of(model)
-    with np.errstate(over="ignore"), pytest.raises(ValueError, match="not finite"):
-        model.learn(14)
-    assert all(map(th.equal, before, model.policy.parameters()))
-    assert_saveable_and_trainable(model, tmp_path / "model")
-
-
 def test_an_environment_that_never_ends_is_an_error_in_whole_episode_mode(tmp_path):
     class Endless(Corridor):
         def step(self, action):
@@ -70,27 +60,6 @@ def test_the_limit_is_for_one_episode_not_for_all():
     assert model.learn(35)._n_updates == 1
     with pytest.raises(ValueError, match="max_episode_steps=6"):
         REINFORCE("MlpPolicy", Corridor((7,)), n_episodes=5, baseline="none", max_episode_steps=6).learn(35)
-
-
-class Break(BaseCallback):
-    def __init__(self, error, at):
-        super().__init__()
-        self.error, self.at = error, at
-
-    def _on_step(self):
-        if self.n_calls == self.at:
-            raise self.error
-        return True
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("callback")])
-@pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 2, "baseline": "leave_one_out"}])
-def test_an_interrupt_leaves_the_last_parameters(error, mode, tmp_path):
-    model = REINFORCE("MlpPolicy", Corridor((7,)), **mode)
-    with pytest.raises(type(error)):
-        model.learn(200, callback=Break(error, at=20))
-    assert model.num_timesteps == 20 and model._n_updates > 0
-    assert_saveable_and_trainable(model, tmp_path / "model")
 
 
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():

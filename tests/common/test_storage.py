@@ -3,10 +3,12 @@
 import io
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import threading
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -15,11 +17,13 @@ import pytest
 import torch as th
 from environments import Corridor
 from models import KINDS, make, plain
-from stable_baselines3 import A2C
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+
+from sb3_reinforce import REINFORCE, FiniteDifference
 
 both = pytest.mark.parametrize("kind", ["steps", "search"])
 
@@ -117,6 +121,14 @@ def test_where_it_saves(tmp_path, monkeypatch):
     for name in names:
         KINDS["steps"][0].load(tmp_path / name, device="cpu")
     assert (tmp_path / "here.zip").stat().st_mode == (tmp_path / "new").stat().st_mode & 0o666 | 0o100000
+
+
+def test_a_parent_that_is_a_file(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for path in (tmp_path / "file" / "model", tmp_path / "file" / "folder" / "model"):
+        with pytest.raises(OSError, match=re.escape(f"{path}.zip")):
+            make("steps").save(path)
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 @both
@@ -245,6 +257,15 @@ WRONG = {
 }
 
 
+OF_ANOTHER_OPTIMIZER = (
+    "another optimizer's groups",
+    "another optimizer's settings",
+    "moments of another shape",
+    "moments missing",
+    "a setting of another kind",
+)
+
+
 @both
 @pytest.mark.parametrize("optimizer", [RMSpropTFLike, th.optim.Adafactor, th.optim.SGD, th.optim.AdamW])
 def test_the_states_of_other_optimizers_are_their_own(optimizer, kind, tmp_path):
@@ -262,9 +283,15 @@ def test_wrong_parameters_change_nothing_at_all(exact_match, wrong, kind):
     model, other = make(kind, Corridor()).learn(32), make(kind, Corridor(), seed=1).learn(64)
     before = plain(model.get_parameters())
     states = WRONG[wrong](other.get_parameters())
-    may_pass = not exact_match and wrong in ("an unknown name", "a method's name", "no optimizer", "a key less")
-    if may_pass:
+    if not exact_match and wrong in ("no optimizer", "a key less"):
         model.set_parameters(states, exact_match=False)
+        return
+    if not exact_match and wrong in OF_ANOTHER_OPTIMIZER:
+        with pytest.warns(UserWarning, match=r"'policy.optimizer'.*It is left out"):
+            model.set_parameters(states, exact_match=False)
+        after = model.get_parameters()
+        assert plain(after["policy"]) == plain(states["policy"])
+        assert ("policy.optimizer", plain(after["policy.optimizer"])) in before
         return
     with pytest.raises((ValueError, TypeError, RuntimeError)):
         model.set_parameters(states, exact_match=exact_match)
@@ -272,14 +299,44 @@ def test_wrong_parameters_change_nothing_at_all(exact_match, wrong, kind):
     model.learn(64, reset_num_timesteps=False)
 
 
-def test_the_optimizer_of_a2c_is_refused_and_named():
-    states = A2C("MlpPolicy", Corridor(), device="cpu").learn(16).get_parameters()
-    model = make("steps", Corridor(), policy_kwargs={})
-    with pytest.raises(ValueError, match=r"'policy.optimizer'.*Adam.*betas.*another optimizer"):
-        model.set_parameters(states, exact_match=False)
-    del states["policy.optimizer"]
-    model.set_parameters(states, exact_match=False)
-    assert all(map(th.equal, model.policy.state_dict().values(), states["policy"].values()))
+@both
+def test_moments_of_another_shape_are_refused_before_the_first_step_too(kind):
+    states = WRONG["moments of another shape"](make(kind, Corridor()).learn(32).get_parameters())
+    with pytest.raises(ValueError, match=r"exp_avg of parameter 0 must have shape .* got \(3, 77\)"):
+        make(kind, Corridor()).set_parameters(states)
+
+
+@both
+@pytest.mark.parametrize(("other", "same_optimizer"), [(A2C, False), (PPO, True)])
+def test_parameters_of_other_algorithms(kind, other, same_optimizer, tmp_path):
+    """The policy's in any case, an optimizer's where it is of the same kind, from a file and from a dictionary."""
+    arguments = {"n_steps": 16} if other is A2C else {"n_steps": 16, "batch_size": 16}
+    trained = other("MlpPolicy", Corridor(), device="cpu", **arguments).learn(16)
+    trained.save(tmp_path / "other")
+    for states in (trained.get_parameters(), tmp_path / "other"):
+        model = make(kind, Corridor(), policy_kwargs={})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model.set_parameters(states, exact_match=False)
+        assert plain(model.policy.state_dict()) == plain(trained.policy.state_dict())
+        assert bool(model.policy.optimizer.state_dict()["state"]) == same_optimizer
+        assert len(caught) == (0 if same_optimizer else 1)
+        model.learn(32)
+
+
+@both
+def test_states_of_what_a_model_does_not_have_are_refused(kind):
+    states = SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10).get_parameters()
+    with pytest.raises(ValueError, match=r"got policy, actor.optimizer, critic.optimizer"):
+        make(kind).set_parameters(states, exact_match=False)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "PPO"])
+def test_the_file_of_another_algorithm_is_named_with_a_remedy(kind, tmp_path):
+    (PPO("MlpPolicy", "CartPole-v1", device="cpu") if kind == "PPO" else make(kind)).save(tmp_path / "other")
+    for algorithm in {REINFORCE, FiniteDifference} - {KINDS.get(kind, (None,))[0]}:
+        with pytest.raises(ValueError, match=r"other was not saved by a .* set_parameters .* exact_match=False"):
+            algorithm.load(tmp_path / "other")
 
 
 class Masked(ActorCriticPolicy):

@@ -20,7 +20,6 @@ from sb3_reinforce.diagnostics import (
 )
 from sb3_reinforce.diagnostics.baseline_comparison import componentwise_residuals, gradient_blocks
 from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.estimation.scores import episode_gradients
 
 BOX = spaces.Box(-1, 1, (1,))
 
@@ -162,7 +161,7 @@ def test_rows_are_the_variances_of_the_gradients_themselves():
     rollout = sample(model, 12)
     for name, baseline in BASELINES.items():
         weights = rollout.discounts * (rollout.returns - baseline(rollout))
-        gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
+        gradients = gradients_by_episode(rollout, weights)[0].double()
         assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
 
 
@@ -206,6 +205,8 @@ def test_bias_is_told_where_theory_knows_it():
 def test_a_users_function_is_a_row_and_the_table_prints():
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10, called("half"))
     assert table.names == ["none", "half", "floor"]
+    assert set(table.legend) == {*table.columns[1:], "[a, b]"}
+    assert all(text in str(table) for text in table.legend.values())
     assert str(table).splitlines()[1].split() == ["baseline", "variance", "ratio", "snr", "bias", "seconds"]
     assert [record["baseline"] for record in table.to_records()] == table.names
     assert table.to_records()[1]["variance_low"] == table["half"].variance.low

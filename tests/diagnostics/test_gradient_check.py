@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.diagnostics.gradient_check import return_by_definition
 from sb3_reinforce.estimation.returns import lambda_return
 
@@ -104,6 +104,27 @@ def test_gsde_cuts_its_scores_unless_it_learns_features():
 def test_a_trained_model_passes():
     table = check_gradient(REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", seed=0).learn(3000))
     assert table.passed, table
+
+
+class Bounded(th.nn.Module):
+    """A parametrization: |log σ| < 2."""
+
+    def forward(self, log_std):
+        return 2 * th.tanh(log_std)
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_a_standard_deviation_shared_between_actions_or_parametrized_passes(is_shared):
+    model = REINFORCE("MlpPolicy", corridor(ACTION_SPACES[2]), baseline="optimal", n_episodes=3, device="cpu", seed=0)
+    if is_shared:
+        model.policy.log_std = th.nn.Parameter(th.zeros(1))
+    else:
+        th.nn.utils.parametrize.register_parametrization(model.policy, "log_std", Bounded())
+    model.policy.optimizer = th.optim.Adam(model.policy.parameters(), lr=1e-3)
+    model.learn(30)
+    table = check_gradient(model)
+    assert table.passed, table
+    assert compare_baselines(model, 6, n_resamples=2)["optimal"].variance.value > 0
 
 
 class Negated(ActorCriticPolicy):

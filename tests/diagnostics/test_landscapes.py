@@ -73,6 +73,7 @@ def test_all_estimators_see_the_same_gradient(algorithm):
     assert table["likelihood_ratio"].steps == 1
     assert [table[name].steps >= evaluations for name, evaluations in (("forward", 17), ("central", 32))] == [True] * 2
     assert table["likelihood_ratio"].snr_per_step.low > 0
+    assert set(table.legend) == {*table.columns[1:], "[a, b]"}
     assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
     model.learn(32)
 
@@ -173,11 +174,17 @@ def test_every_picture_can_be_saved(tmp_path):
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 20)
     ax = plots.plot_baselines(table)
     assert [label.get_text() for label in ax.get_yticklabels()] == table.names[:-1]
+    assert ax.get_xlabel() == "variance / variance of none"
+    drawn = {line.get_ydata()[0]: line for line in ax.get_lines() if len(line.get_xdata()) == 1}
+    for y, row in enumerate(list(table)[:-1]):
+        assert drawn[y].get_xdata() == [row.ratio.value]
+        assert (drawn[y].get_markerfacecolor() == "white") == (row.bias != 0)
     save(ax, tmp_path / "baselines.png")
     ax = plots.plot_learning_curves({"a": np.random.rand(5, 8), "b": np.random.rand(4, 3, 8)}, np.arange(8))
     assert [line.get_label() for line in ax.get_lines()] == ["a (5 runs)", "b (4 runs)"]
     save(ax, tmp_path / "curves.png")
     ax = plots.plot_landscape(landscape(bandit(), {"g": th.ones(4)}, n_points=3, n_episodes=2))
+    assert ax.get_title() and ax.get_xlim() == (-1, 1)
     save(ax, tmp_path / "landscape.png")
     ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])
     save(ax, tmp_path / "variances.png")

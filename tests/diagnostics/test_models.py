@@ -9,6 +9,7 @@ import torch as th
 from environments import Corridor, Tree
 from gymnasium import spaces
 from stable_baselines3 import A2C
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -30,9 +31,15 @@ def lab():
         "check_gradient": lambda model: check_gradient(model, 2),
         "compare_baselines": lambda model: compare_baselines(model, 4, n_resamples=2),
         "compare_estimators": lambda model: compare_estimators(model, 4, 3, n_delta=2, n_resamples=2),
+        "likelihood_ratio": lambda model: compare_estimators(model, 4, estimators="likelihood_ratio", n_resamples=2),
         "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
         "sample": lambda model: sample(model, 2),
     }
+
+
+def starts_with_an_episode(rollout):
+    """In a Corridor, whose observation is the timestep."""
+    return not rollout.timesteps[0].any() and bool((rollout.observations[0].argmax(-1) == 0).all())
 
 
 callbacks = {"pitfalls": PitfallCallback, "quality": lambda: GradientQualityCallback(1)}
@@ -69,8 +76,104 @@ def test_a_model_is_as_it_was_and_goes_on(measure):
     assert all(th.equal(value, parameters[name]) for name, value in model.policy.state_dict().items())
     model.learn(16, reset_num_timesteps=False)
     assert model.num_timesteps == 32
-    assert model.rollout.timesteps[0].tolist() == [0, 0]
-    assert (model.rollout.observations[0].argmax(-1) == 0).all()
+    assert starts_with_an_episode(model.rollout)
+
+
+class Measuring(BaseCallback):
+    """Measures a model where ``learn`` calls one of its methods, in the second rollout."""
+
+    def __init__(self, where, measure):
+        super().__init__()
+        self.where, self.measure = where, measure
+
+    def at(self, where):
+        if where == self.where and self.num_timesteps >= 16:
+            self.measure(self.model)
+        return True
+
+    def _on_rollout_start(self):
+        self.at("on_rollout_start")
+
+    def _on_step(self):
+        return self.at("on_step")
+
+    def _on_rollout_end(self):
+        self.at("on_rollout_end")
+
+
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_a_measurement_that_would_cut_a_rollout_is_refused(measure):
+    model = REINFORCE("MlpPolicy", Corridor((7,)), n_steps=16, seed=0, device="cpu")
+    with pytest.raises(ValueError, match="model is collecting a rollout"):
+        model.learn(48, Measuring("on_step", measure))
+    assert starts_with_an_episode(model.learn(16).rollout)
+
+
+@pytest.mark.parametrize("where", ["on_rollout_start", "on_rollout_end"])
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_a_callback_may_measure_between_rollouts(where, measure):
+    model = REINFORCE("MlpPolicy", Corridor((7,)), n_steps=16, seed=0, device="cpu")
+    rollout = model.learn(32 if where == "on_rollout_start" else 48, Measuring(where, measure)).rollout
+    assert starts_with_an_episode(rollout)
+    assert rollout.timesteps.flatten().tolist() == [t % 7 for t in range(16)]
+
+
+class Interrupted(Corridor):
+    """Ctrl-C at the second step of an episode."""
+
+    is_armed = False
+
+    def step(self, action):
+        if self.is_armed and self.t == 1:
+            raise KeyboardInterrupt
+        return super().step(action)
+
+
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_after_ctrl_c_a_model_starts_with_an_episode(measure):
+    model = REINFORCE("MlpPolicy", Interrupted((7,)), n_steps=16, seed=0, device="cpu").learn(16)
+    model.env.envs[0].unwrapped.is_armed = True
+    with pytest.raises(KeyboardInterrupt):
+        measure(model)
+    model.env.envs[0].unwrapped.is_armed = False
+    assert starts_with_an_episode(model.learn(16, reset_num_timesteps=False).rollout)
+
+
+@pytest.mark.parametrize("measure", lab().values(), ids=lab())
+def test_generators_of_gpus_are_left_alone(measure, monkeypatch):
+    monkeypatch.setattr(th.cuda, "manual_seed_all", lambda seed: pytest.fail("all GPUs were seeded"))
+    measure(REINFORCE("MlpPolicy", Tree(), device="cpu"))
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.filterwarnings("ignore:You are trying to run:UserWarning")
+def test_generators_of_gpus_go_on_after_a_measurement():
+    model = REINFORCE("MlpPolicy", Tree(), device="cuda")
+    before = th.cuda.get_rng_state_all()
+    tables = [compare_baselines(model, 20, n_resamples=2).to_records() for _ in range(2)]
+    assert [row["variance"] for row in tables[0]] == [row["variance"] for row in tables[1]]
+    assert check_gradient(model).passed
+    assert all(map(th.equal, th.cuda.get_rng_state_all(), before))
+
+
+@pytest.mark.filterwarnings("ignore:The gradient is mostly noise:UserWarning")
+@pytest.mark.parametrize("callback", callbacks)
+def test_a_callback_survives_frozen_parameters(callback):
+    """One of the actor's in the third rollout, all of them in the fifth, none from the seventh on."""
+
+    class Freezing(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            n, policy = self.num_timesteps // 16, self.model.policy
+            policy.action_net.bias.requires_grad_(not 2 <= n < 6)
+            for module in (policy.action_net.weight, policy.mlp_extractor.policy_net):
+                module.requires_grad_(not 4 <= n < 6)
+
+    model = REINFORCE("MlpPolicy", Corridor((3, 7)), n_steps=16, seed=0, device="cpu")
+    model.learn(16 * 60, [Freezing(), callbacks[callback]()])
+    assert model.num_timesteps == 16 * 60
 
 
 @pytest.mark.parametrize("measure", lab().values(), ids=lab())

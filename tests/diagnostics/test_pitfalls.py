@@ -138,6 +138,33 @@ def test_a_pitfall_starts_at_its_threshold(name, falls, stays):
     assert PITFALLS[name](history(*stays)) is None
 
 
+def test_of_several_pitfalls_with_one_cause_the_cause_is_reported():
+    assert set(fall("CartPole-v1", 8000, learning_rate=1.0)) == {"rate_too_large"}
+
+
+def test_a_negative_signal_to_noise_ratio_is_not_a_number_for_a_reader():
+    found = history(*seen(few, n=50))
+    for index, update in enumerate(found.updates):
+        update.gradient.fill_((-1) ** index)
+    sentence = PITFALLS["too_few_episodes"](found)
+    assert "its signal-to-noise ratio is not distinguishable from 0, with" in sentence
+
+
+def test_the_gradient_is_judged_with_the_weights_of_training():
+    """Of returns that hardly differ from 400, normalization leaves the difference."""
+    still = {**whole, "n_episodes": 4, "learning_rate": 1e-9, "gamma": 1.0}
+    env = rewarded((1,), lambda t, action: 400.0 + action + 0.1 * noise(t, action))
+    assert "too_few_episodes" in fall(env, 400, **still)
+    assert "too_few_episodes" not in fall(env, 400, normalize_advantage=True, **still)
+
+
+def test_a_falling_temperature_is_not_blamed_on_the_learning_rate():
+    change = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([0.5, 0.0]))}
+    found = fall(rewarded((4,)), 640, learning_rate=0.0, temperature=lambda progress: progress**8, **change)
+    assert set(found) == {"deterministic_too_early"}
+    assert "temperature (now 0.0" in found["deterministic_too_early"]
+
+
 def test_batches_as_small_as_in_a2c_are_found():
     found = fall("CartPole-v1", 2000, n_envs=4, n_steps=5)
     assert "n_steps, or the number of environments" in found["too_few_episodes"]

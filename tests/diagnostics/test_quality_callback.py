@@ -8,10 +8,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.diagnostics import GradientQualityCallback
+from sb3_reinforce.diagnostics import GradientQualityCallback, gradients_by_episode
 from sb3_reinforce.diagnostics.quality_callback import evenly_spread
 from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.estimation.scores import episode_gradients
 
 
 class Recorded(Logger):
@@ -48,17 +47,21 @@ def test_it_serves_one_model_after_another():
     assert histories[0] == histories[1]
 
 
-@pytest.mark.parametrize("kwargs", [{"baseline": "none"}, {"baseline": "mean"}])
+@pytest.mark.parametrize(
+    "kwargs", [{"baseline": "none"}, {"baseline": "mean"}, {"baseline": "none", "normalize_advantage": True}]
+)
 def test_the_signal_to_noise_ratio_has_the_weights_of_training(kwargs):
     model = train(GradientQualityCallback(1), 1, n_episodes=8, learning_rate=0.0, **kwargs)
     rollout = model.rollout
     weights = rollout.returns - BASELINES[model.baseline](rollout)
-    gradients = th.stack([gradient for (gradient,) in episode_gradients(rollout, weights)]).double()
+    if model.normalize_advantage:
+        weights = (weights - weights[rollout.used].mean()) / weights[rollout.used].std()
+    gradients = gradients_by_episode(rollout, weights)[0].double()
     trace = float(gradients.var(0).sum())
     signal = float(gradients.mean(0).square().sum()) - trace / 8
     history = model.logger.history
     assert history["gradient/snr"] == [pytest.approx(8 * signal / trace, rel=1e-3)]
-    if model.baseline == "none":
+    if kwargs == {"baseline": "none"}:
         assert history["gradient/variance/none"] == [pytest.approx(trace, rel=1e-4)]
 
 

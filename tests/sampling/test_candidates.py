@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from models import Scaled
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce.policies import parameters
@@ -46,24 +46,13 @@ class OwnPrediction(ActorCriticPolicy):
         return super()._predict(observation, deterministic)
 
 
-class OwnExtractor(FlattenExtractor):
-    """Known under three names in a policy that shares it."""
-
-    def __init__(self, space: spaces.Space) -> None:
-        super().__init__(space)
-        self.scale = th.nn.Parameter(th.ones(self.features_dim))
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.scale * super().forward(observations)
-
-
 POLICIES = [
     (LinearPolicy, BOX, {}, MatrixActor),
     (ActorCriticPolicy, BOX, {}, MatrixActor),
     (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.GELU), MatrixActor),
     (ActorCriticPolicy, BOX, dict(activation_fn=th.nn.PReLU), LoopActor),
     (ActorCriticPolicy, BOX, dict(activation_fn=lambda: th.nn.Softmax(dim=1)), LoopActor),
-    (ActorCriticPolicy, BOX, dict(features_extractor_class=OwnExtractor), LoopActor),
+    (ActorCriticPolicy, BOX, dict(features_extractor_class=Scaled), LoopActor),
     (ActorCriticPolicy, spaces.Discrete(5), {}, MatrixActor),
     (ActorCriticPolicy, spaces.Box(-1, 1, (2, 3)), dict(share_features_extractor=False), MatrixActor),
     (ActorCriticCnnPolicy, IMAGE, {}, LoopActor),

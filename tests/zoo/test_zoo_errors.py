@@ -55,7 +55,7 @@ def test_a_configuration_without_settings_is_named(
         ("policy: MlpPolicy", "must hold n_timesteps"),
         ("n_timesteps: 100", "must hold policy"),
         ("policy: 5, n_timesteps: 100", "policy must be a name, or the path of a class, got 5"),
-        ("policy: Mlp, n_timesteps: 100", "Policy Mlp unknown"),
+        ("policy: Mlp, n_timesteps: 100", "policy must be a class or one of 'MlpPolicy'"),
         ("policy: MlpPolicy, n_timesteps: 1e6", "write !!float 1e6"),
         ("policy: MlpPolicy, n_timesteps: 0", "n_timesteps must be finite and >= 1, got 0"),
         ("policy: MlpPolicy, n_timesteps: 100, n_envs: 0", "n_envs must be at least 1, got 0"),

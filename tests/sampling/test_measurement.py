@@ -1,0 +1,102 @@
+"""Measurements in a model's environments: the model then goes on as if nothing had happened."""
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from models import KINDS, Scaled, make, plain
+from stable_baselines3 import A2C
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_reinforce.diagnostics import compare_estimators, landscape
+from sb3_reinforce.sampling.measurement import undisturbed
+
+MEASUREMENTS: dict[str, Any] = {
+    "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
+    "compare_estimators": lambda model: compare_estimators(
+        model, n_episodes=3, n_estimates=3, n_delta=2, n_resamples=5, estimators=("central", "likelihood_ratio")
+    ),
+}
+
+
+def observation(env: VecNormalize) -> np.ndarray:
+    """What the environments show now."""
+    return np.array([single.unwrapped.state for single in env.unwrapped.envs])
+
+
+@pytest.mark.parametrize("measure", MEASUREMENTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind: str, measure: str) -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 2))
+    model = make(kind, env, policy_kwargs={"features_extractor_class": Scaled}).learn(20)
+    before, count = plain(model.policy.state_dict()), env.obs_rms.count
+    MEASUREMENTS[measure](model)
+    assert plain(model.policy.state_dict()) == before and env.obs_rms.count == count and env.training
+    assert np.allclose(model._last_obs, env.normalize_obs(observation(env)), atol=1e-5)
+    assert model._last_episode_starts.all()
+    model.learn(40, reset_num_timesteps=False)
+    assert plain(model.policy.state_dict()) != before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: type[BaseException]) -> None:
+    env = VecNormalize(make_vec_env("CartPole-v1", 2))
+    model = make("steps", env).learn(20)
+    with pytest.raises(error), undisturbed(model):
+        env.step(np.zeros(2, dtype=int))
+        raise error
+    assert env.training
+
+    class First(BaseCallback):
+        def _on_step(self) -> bool:
+            return False
+
+        def _on_rollout_start(self) -> None:
+            assert np.allclose(self.model._last_obs, env.normalize_obs(observation(env)), atol=1e-5)
+            assert self.model._last_episode_starts.all()
+
+    model.learn(20, First(), reset_num_timesteps=False)
+
+
+class Interrupted(ActorCriticPolicy):
+    """Ctrl-C comes in the middle of a candidate's action."""
+
+    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        os.kill(os.getpid(), signal.SIGINT)
+        return super()._predict(observation, deterministic)
+
+
+def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
+    model = A2C(Interrupted, "CartPole-v1", device="cpu")
+    before = plain(model.policy.state_dict())
+    with pytest.raises(KeyboardInterrupt):
+        landscape(model, n_points=2, n_episodes=1)
+    assert plain(model.policy.state_dict()) == before and model._last_obs is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind: str) -> None:
+    class Measure(BaseCallback):
+        n_made = 0
+
+        def _on_rollout_start(self) -> None:
+            with undisturbed(self.model):
+                self.n_made += 1
+
+        def _on_step(self) -> bool:
+            with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
+                self._on_rollout_start()
+            return True
+
+        def _on_rollout_end(self) -> None:
+            self._on_rollout_start()
+
+    callback = Measure()
+    model = make(kind).learn(50, callback)
+    assert callback.n_made == 2 * model._n_updates > 0
