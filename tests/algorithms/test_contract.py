@@ -28,7 +28,6 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
@@ -301,26 +300,6 @@ def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(space, 
     model = REINFORCE(policy, Random(space), n_steps=10, learning_rate=0.0, critic_learning_rate=1e-3)
     names = {name for name, _ in model.policy.named_parameters()}
     assert moved_by_learning(model, 20) == {name for name in names if "value_net" in name}
-
-
-class BatchNormExtractor(FlattenExtractor):
-    """An extractor that actor and critic share, with statistics that move when it is evaluated in training mode."""
-
-    def __init__(self, observation_space):
-        super().__init__(observation_space)
-        self.batch_norm = th.nn.BatchNorm1d(self.features_dim)
-
-    def forward(self, observations):
-        return self.batch_norm(super().forward(observations))
-
-
-def test_the_critics_passes_leave_the_statistics_of_a_shared_extractor_alone():
-    statistics = []
-    for n_critic_updates in (1, 20):
-        kwargs = {"features_extractor_class": BatchNormExtractor}
-        model = REINFORCE("MlpPolicy", "CartPole-v1", n_critic_updates=n_critic_updates, seed=0, policy_kwargs=kwargs)
-        statistics.append(model.learn(32).policy.features_extractor.batch_norm.running_mean.clone())
-    assert th.equal(*statistics) and statistics[0].abs().sum() > 0
 
 
 @both_modes
