@@ -210,13 +210,13 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
 
 def tanh_in_place(x: Floats) -> Floats:
     """``x ← tanh x``."""
-    np.tanh(x, out=x)
+    np.tanh(x, x)
     return x
 
 
 def relu_in_place(x: Floats) -> Floats:
     """``x ← max(x, 0)``."""
-    np.maximum(x, 0, out=x)
+    np.maximum(x, 0, x)
     return x
 
 
@@ -229,7 +229,7 @@ def linear_operation(layer: nn.Linear, n: int) -> Callable[[Floats], Floats]:
 
     def by_numpy(x: Floats) -> Floats:
         np.dot(x, transposed, y)
-        np.add(y, bias, out=y)
+        np.add(y, bias, y)
         return y
 
     def by_torch(x: Floats) -> Floats:

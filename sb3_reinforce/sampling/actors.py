@@ -168,11 +168,13 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
 def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.ndarray]:
     """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
     noise = th.empty(n_envs, n_actions)
-    exponential = noise.numpy()
+    scores = noise.numpy()
 
     def sample(logits: Floats) -> np.ndarray:
         noise.exponential_()
-        actions: np.ndarray = (logits - np.log(exponential)).argmax(axis=1)
+        np.log(scores, scores)
+        np.subtract(logits, scores, scores)
+        actions: np.ndarray = scores.argmax(1)
         return actions
 
     return sample
