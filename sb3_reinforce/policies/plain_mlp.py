@@ -216,7 +216,7 @@ def tanh_in_place(x: Floats) -> Floats:
 
 def relu_in_place(x: Floats) -> Floats:
     """``x ← max(x, 0)``."""
-    np.maximum(x, 0, x)
+    np.maximum(x, 0, out=x)
     return x
 
 
