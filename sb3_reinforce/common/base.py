@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from inspect import signature
+from io import BytesIO
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
 from sb3_reinforce.common.states import check_finite, generator_states, optimizer_mismatch, restore_generators
-from sb3_reinforce.common.storage import PathOrFile, atomic_write, check_archive
+from sb3_reinforce.common.storage import PathOrFile, check_archive, write_whole
 
 __all__ = ["BasePolicyGradient", "uninterrupted"]
 
@@ -57,9 +58,8 @@ class BasePolicyGradient(BaseAlgorithm):
         check_policy_name(policy, self.policy_aliases)
         if needs_env or env is not None:
             env = check_env(env, verbose)
-        if policy_kwargs is not None:
-            # Stable-Baselines3 writes to it
-            kwargs["policy_kwargs"] = dict(policy_kwargs)
+        # A copy: Stable-Baselines3 writes to it
+        kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)
 
@@ -119,8 +119,9 @@ class BasePolicyGradient(BaseAlgorithm):
         :raises OSError: If the file cannot be written
         """
         self._random_state = generator_states(self.device)
-        with atomic_write(path) as file:
-            super().save(file, exclude, include)
+        buffer = BytesIO()
+        super().save(buffer, exclude, include)
+        write_whole(path, buffer.getvalue())
 
     @classmethod
     def load(

@@ -7,11 +7,9 @@ import shutil
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
-from uuid import uuid4
 
 from stable_baselines3.common.save_util import open_path
 
@@ -21,34 +19,22 @@ PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 READ_ERRORS = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, zlib.error)
 
 
-@contextmanager
-def atomic_write(target: PathOrFile) -> Iterator[io.BytesIO]:
-    """Yield a buffer that replaces a file at the end of the block; if the block fails, the file stays as it was."""
-    buffer = io.BytesIO()
-    if isinstance(target, (str, Path)):
-        yield buffer
-        replace(save_path(Path(target)), buffer.getvalue())
-    else:
-        file = open_path(target, "w")
-        yield buffer
-        file.write(buffer.getvalue())
-
-
-def save_path(path: Path) -> Path:
-    """Return where Stable-Baselines3 saves to: with a suffix, beside a folder of that name, behind a link."""
+def write_whole(target: PathOrFile, content: bytes) -> None:
+    """Write to where Stable-Baselines3 saves; at each moment either the old file or the new one exists."""
+    if not isinstance(target, (str, Path)):
+        open_path(target, "w").write(content)
+        return
+    path = Path(target)
     path = path if path.suffix else path.with_name(f"{path.name}.zip")
     if path.is_dir():
-        warnings.warn(f"{path} is a folder: the model is saved to {path}_2", stacklevel=5)
+        warnings.warn(f"{path} is a folder: the model is saved to {path}_2", stacklevel=3)
         path = path.with_name(f"{path.name}_2")
-    return path.resolve()
-
-
-def replace(path: Path, content: bytes) -> None:
-    """Replace a file in one step and keep its permissions; at each moment either the old file or the new one exists."""
-    temporary = path.with_name(f".{uuid4().hex}.tmp")
+    # Behind a link, which stays one
+    path = path.resolve()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+            temporary = Path(folder, path.name)
             with open(temporary, "xb") as file:
                 if path.exists():
                     shutil.copymode(path, temporary)
@@ -56,8 +42,6 @@ def replace(path: Path, content: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
