@@ -1,8 +1,8 @@
 """
 The expected gradient by exact enumeration: the sum over all batches of N episodes of their probability times ĝ.
 
-The policy is a softmax over a table, in float64; the batch goes through the package's own returns, baselines and
-denominators. ∇E[G_0] comes from autograd through the probabilities of the trajectories.
+The policy is a softmax over a table, in float64; weights and denominators are the package's. ∇E[G_0] comes from
+autograd through the probabilities of the trajectories.
 """
 
 from itertools import product

@@ -12,11 +12,7 @@ from gymnasium import spaces
 
 
 class Tree(gym.Env[np.ndarray, np.int64]):
-    """
-    Two actions, two steps, observations one-hot: node 0, then node 1 or 2 by the first action.
-
-    :param ragged: Whether the first action 1 ends the episode at once
-    """
+    """Node 0, then node 1 or 2 by the first action; if ``ragged``, a first action 1 ends the episode."""
 
     rewards = np.array([[3.0, -1.0], [5.0, -2.0], [1.0, 4.0]])
 
@@ -53,14 +49,7 @@ class Tree(gym.Env[np.ndarray, np.int64]):
 
 
 class Corridor(gym.Env[np.ndarray, Any]):
-    """
-    Episodes of drawn lengths, whatever the action; the observation is the one-hot timestep.
-
-    :param lengths: The lengths to draw from
-    :param reward: The reward of (timestep, action)
-    :param action_space: Any action space
-    :param truncate: Whether an episode ends by truncation instead of termination
-    """
+    """Episodes of drawn lengths, whatever the action; the observation is the one-hot timestep."""
 
     def __init__(
         self,
@@ -89,16 +78,40 @@ class Corridor(gym.Env[np.ndarray, Any]):
         return np.eye(max(self.lengths) + 1, dtype=np.float32)[self.t, :-1]
 
 
+class Random(Corridor):
+    """Observations drawn from any space; counts steps and episodes and refuses actions outside their space."""
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any] | None = None,
+        lengths: tuple[int, ...] = (5,),
+        truncate: bool = True,
+    ):
+        super().__init__(lengths, lambda t, action: self.draw_reward(), action_space, truncate)
+        self.observation_space = observation_space
+        self.n_steps = self.n_episodes = 0
+
+    def draw_reward(self) -> float:
+        return float(self.np_random.normal() * 10.0 ** self.np_random.integers(-3, 4))
+
+    def observe(self) -> Any:
+        return self.observation_space.sample()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        assert self.action_space.contains(action), action
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.n_steps += 1
+        self.n_episodes += terminated or truncated
+        return obs, reward, terminated, truncated, info
+
+
 class Faulty(Corridor):
     """
-    Episodes of seven steps; does something wrong at one step of its life, or at one reset.
+    Episodes of seven steps; something goes wrong at step ``at`` of its life, or at reset ``at``.
 
-    :param fault: What: "reward", "observation" or "first observation" is ``value``; "raise" or "die", "in step" or "in
-        reset"; or the name of a signal that the learner gets in the middle of a step
-    :param at: When, counted from 1
-    :param value: What is returned then, or raised
-    :param truncate: Whether episodes end by truncation
-    :param observation_space: Its space, if it is another
+    The fault is "reward", "observation" or "first observation", which are ``value`` then; "raise" or "die", "in step"
+    or "in reset"; or the name of a signal that the learner gets in the middle of a step.
     """
 
     def __init__(

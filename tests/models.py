@@ -18,25 +18,14 @@ KINDS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any]]] = {
 
 
 def make(kind: str, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:
-    """
-    A small model.
-
-    :param kind: Which one
-    :param env: The environment
-    :param policy: The policy
-    :param kwargs: Further arguments
-    """
+    """A small model of a kind."""
     algorithm, arguments = KINDS[kind]
     fixed = {"device": "cpu", "policy_kwargs": {"net_arch": [4]}}
     return algorithm(policy, env, **{**fixed, **arguments, **kwargs})  # type: ignore[call-arg]
 
 
 def plain(state: Any) -> Any:
-    """
-    The numbers of nested states, to compare them.
-
-    :param state: As of ``get_parameters``
-    """
+    """The numbers of nested states as in ``get_parameters``, to compare them."""
     if isinstance(state, dict):
         return [(str(key), plain(value)) for key, value in sorted(state.items(), key=lambda item: str(item[0]))]
     if isinstance(state, (list, tuple)):
@@ -44,8 +33,15 @@ def plain(state: Any) -> Any:
     return state.numpy().tobytes() if isinstance(state, th.Tensor) else repr(state)
 
 
+def moved_by_learning(model: Any, total_timesteps: int) -> set[str]:
+    """The names of the policy's parameters that training changes."""
+    before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
+    model.learn(total_timesteps)
+    return {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
+
+
 class Scaled(FlattenExtractor):
-    """A features extractor with code and a parameter of its own; a policy that shares it knows it by three names."""
+    """A user's features extractor with a parameter, which a policy that shares it knows by three names."""
 
     def __init__(self, space: spaces.Space[Any]):
         super().__init__(space)

@@ -215,22 +215,30 @@ class BasePolicyGradient(BaseAlgorithm):
                 f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
             )
         own = {name: states[name] for name in names if name in states}
-        for name, state in list(own.items()):
+        for name, state in own.items():
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
+        # A mask that a user's policy adds to its logits may well be infinite
+        check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
+        before: Any = deepcopy(self.get_parameters())
+        try:
+            if "policy" in own:
+                self.policy.load_state_dict(own["policy"], strict=exact_match)
+            super().set_parameters(self._fitting(own, exact_match), exact_match, device)
+        except BaseException:
+            super().set_parameters(before, device=device)
+            raise
+
+    def _fitting(self, states: dict[str, Any], exact_match: bool) -> dict[str, Any]:
+        """The states without optimizers of another kind, which are an error with ``exact_match``."""
+        fitting = dict(states)
+        for name, state in states.items():
             part = recursive_getattr(self, name)
             reason = optimizer_mismatch(part, state) if isinstance(part, th.optim.Optimizer) else ""
             if reason:
                 needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
                 if exact_match:
                     raise ValueError(f"{needed}, but {reason}")
-                del own[name]
-                warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=2)
-        # A mask that a user's policy adds to its logits may well be infinite
-        check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
-        before: Any = deepcopy(self.get_parameters())
-        try:
-            super().set_parameters(own, exact_match, device)
-        except BaseException:
-            super().set_parameters(before, device=device)
-            raise
+                del fitting[name]
+                warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
+        return fitting

@@ -1,30 +1,14 @@
 """The worked examples of the chapter on policy gradient estimation."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environments import Corridor
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.policies.evaluation import log_prob_and_entropy
-
-
-class OneStep(gym.Env):
-    """One state, one step; each action has its reward."""
-
-    def __init__(self, rewards):
-        self.observation_space = spaces.Box(1, 1, (1,))
-        self.action_space = spaces.Discrete(len(rewards))
-        self.rewards = rewards
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.ones(1, dtype=np.float32), {}
-
-    def step(self, action):
-        return np.ones(1, dtype=np.float32), self.rewards[action], True, False, {}
 
 
 class ScriptedPolicy(ActorCriticPolicy):
@@ -39,9 +23,10 @@ class ScriptedPolicy(ActorCriticPolicy):
 
 
 def learn(rewards, script, **kwargs):
-    """One gradient step from zero parameters on the episodes that the script tells."""
+    """One gradient step from zero parameters on episodes of one step: each action of the script has its reward."""
+    env = Corridor((1,), lambda t, action: rewards[action], spaces.Discrete(len(rewards)))
     policy_kwargs = {"net_arch": [], "optimizer_class": th.optim.SGD}
-    model = REINFORCE(ScriptedPolicy, OneStep(rewards), policy_kwargs=policy_kwargs, n_episodes=len(script), **kwargs)
+    model = REINFORCE(ScriptedPolicy, env, policy_kwargs=policy_kwargs, n_episodes=len(script), **kwargs)
     model.policy.script = script
     with th.no_grad():
         for parameter in model.policy.parameters():
@@ -63,13 +48,9 @@ def test_left_or_right():
 
 def test_actions_with_returns_8_10_12():
     """With the mean as baseline the average action gets no push, and the others −2 and 2."""
-    model = learn([8.0, 10.0, 12.0], [0, 1, 2], baseline="mean")
-    assert model.rollout_buffer.advantages.ravel().tolist() == [-2, 0, 2]
-    assert learn([8.0, 10.0, 12.0], [0, 1, 2], baseline="none").rollout_buffer.advantages.ravel().tolist() == [
-        8,
-        10,
-        12,
-    ]
+    for baseline, expected in (("mean", [-2, 0, 2]), ("none", [8, 10, 12])):
+        model = learn([8.0, 10.0, 12.0], [0, 1, 2], baseline=baseline)
+        assert model.rollout_buffer.advantages.ravel().tolist() == expected
 
 
 def gradient_of_log_prob(policy, obs, action, parameter):
@@ -93,7 +74,8 @@ def test_score_of_a_gaussian_policy():
     obs, action = th.randn(1, 3), th.tensor([[1.5]])
     with th.no_grad():
         difference, std = action - policy.get_distribution(obs).mode(), policy.log_std.exp()
-    score = gradient_of_log_prob(policy, obs, action, policy.action_net.bias)
-    th.testing.assert_close(score, (difference / std**2)[0])
-    score = gradient_of_log_prob(policy, obs, action, policy.log_std)
-    th.testing.assert_close(score, (difference**2 / std**2 - 1)[0])
+    for parameter, expected in (
+        (policy.action_net.bias, difference / std**2),
+        (policy.log_std, difference**2 / std**2 - 1),
+    ):
+        th.testing.assert_close(gradient_of_log_prob(policy, obs, action, parameter), expected[0])

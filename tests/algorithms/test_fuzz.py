@@ -1,5 +1,5 @@
 """
-Random configurations: a valid one trains, stays finite and keeps exact books; an invalid one names an argument.
+Random configurations: a valid one trains, stays finite and counts exactly; an invalid one names an argument.
 
 ``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand of each instead of a hundred.
 """
@@ -7,9 +7,9 @@ Random configurations: a valid one trains, stays finite and keeps exact books; a
 import os
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from environments import Random
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
@@ -32,50 +32,19 @@ fuzzed = settings(
 )
 
 
-class Drawn(gym.Env):
-    """
-    Any spaces, episodes of drawn lengths, which it counts.
-
-    :param observation_space: A space
-    :param action_space: A space
-    :param longest: The longest length
-    :param truncate: Whether episodes end by truncation
-    """
-
-    def __init__(self, observation_space, action_space, longest, truncate):
-        self.observation_space, self.action_space = observation_space, action_space
-        self.longest, self.truncate, self.n_steps, self.n_episodes = longest, truncate, 0, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t, self.length = 0, int(self.np_random.integers(1, self.longest + 1))
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        self.t, self.n_steps = self.t + 1, self.n_steps + 1
-        done = self.t == self.length
-        self.n_episodes += done
-        reward = float(self.np_random.normal() * 10.0 ** self.np_random.integers(-3, 4))
-        return self.observation_space.sample(), reward, done and not self.truncate, done and self.truncate, {}
-
-
-class Books(BaseCallback):
+class Counts(BaseCallback):
     """Checks at each step and rollout what can be counted."""
 
     def _on_step(self):
-        envs = self.training_env.get_attr("unwrapped")
-        assert self.num_timesteps == sum(env.n_steps for env in envs)
+        assert self.num_timesteps == sum(self.training_env.get_attr("n_steps"))
         return True
 
     def _on_rollout_end(self):
-        model = self.model
-        if isinstance(model, REINFORCE):
-            buffer, n_envs = model.rollout_buffer, model.n_envs
-            assert buffer.full and buffer.rewards.shape == (buffer.buffer_size, n_envs)
-            assert model.n_steps in (None, buffer.buffer_size)
+        if isinstance(self.model, REINFORCE):
+            buffer = self.model.rollout_buffer
+            assert buffer.full and self.model.n_steps in (None, buffer.buffer_size)
             for rows in (buffer.rewards, buffer.advantages, buffer.returns, buffer.log_probs):
-                assert rows.shape == buffer.rewards.shape and np.isfinite(rows).all()
+                assert rows.shape == (buffer.buffer_size, self.model.n_envs) and np.isfinite(rows).all()
 
 
 sizes = st.integers(1, 3)
@@ -100,9 +69,9 @@ floats = st.floats
 @st.composite
 def environments(draw):
     observation_space, action_space = draw(observations), draw(actions)
-    longest, truncate, n_envs = draw(st.integers(1, 6)), draw(st.booleans()), draw(st.integers(1, 4))
-    make = lambda: Monitor(Drawn(observation_space, action_space, longest, truncate))  # noqa: E731
-    env = DummyVecEnv([make] * n_envs)
+    lengths, truncate = tuple(range(1, draw(st.integers(2, 7)))), draw(st.booleans())
+    make = lambda: Monitor(Random(observation_space, action_space, lengths, truncate))  # noqa: E731
+    env = DummyVecEnv([make] * draw(st.integers(1, 4)))
     if isinstance(observation_space, spaces.Box):
         wrapper = draw(st.sampled_from(["none", "normalize", "both"]))
         env = env if wrapper == "none" else VecNormalize(env)
@@ -116,7 +85,7 @@ COMMON = {
     "max_grad_norm": st.one_of(st.none(), floats(0.01, 10)),
     "seed": st.integers(0, 2**31),
 }
-OF_REINFORCE = COMMON | {
+REINFORCE_STRATEGIES = COMMON | {
     "gamma": floats(0, 1),
     "ent_coef": floats(0, 1),
     "vf_coef": floats(0, 1),
@@ -128,7 +97,7 @@ OF_REINFORCE = COMMON | {
     "batch_size": st.integers(1, 64),
     "normalize_advantage": st.booleans(),
 }
-OF_SEARCH = COMMON | {
+FINITE_DIFFERENCE_STRATEGIES = COMMON | {
     "estimator": st.sampled_from(["regression", "central", "forward"]),
     "perturbation": st.sampled_from(["sphere", "gaussian", "rademacher", "coordinate"]),
     "delta_std": st.one_of(st.none(), floats(1e-3, 1), st.just(lambda p: 0.1 + p)),
@@ -141,27 +110,23 @@ OF_SEARCH = COMMON | {
 
 @st.composite
 def reinforce_arguments(draw):
-    chosen = draw(st.fixed_dictionaries({}, optional=OF_REINFORCE))
+    chosen = draw(st.fixed_dictionaries({}, optional=REINFORCE_STRATEGIES))
     whole = draw(st.booleans())
     # Without a critic some episode must end: the longest has 6 steps
     n_steps = draw(st.integers(1, 9)) if chosen.get("baseline", "value") == "value" else draw(st.integers(6, 9))
     return {**chosen, **({"n_episodes": draw(st.integers(2, 6))} if whole else {"n_steps": n_steps})}
 
 
-def policy_for(env):
-    return "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
-
-
 def assert_trains(algorithm, env, arguments):
-    model = algorithm(policy_for(env), env, device="cpu", policy_kwargs={"net_arch": [4]}, **arguments)
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+    model = algorithm(policy, env, device="cpu", policy_kwargs={"net_arch": [4]}, **arguments)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Episodes that n_steps cuts are left out")
         warnings.filterwarnings("ignore", "n_delta=. perturbations do not determine")
-        model.learn(30, Books())
+        model.learn(30, Counts())
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-    inner = env.get_attr("unwrapped")
-    assert model.num_timesteps == sum(each.n_steps for each in inner) >= 30
-    n_episodes = sum(each.n_episodes for each in inner)
+    assert model.num_timesteps == sum(env.get_attr("n_steps")) >= 30
+    n_episodes = sum(env.get_attr("n_episodes"))
     if algorithm is REINFORCE and model.n_steps is not None:
         assert len(model.ep_info_buffer) == min(n_episodes, 100)
         assert model.num_timesteps == model._n_updates * model.n_steps * env.num_envs
@@ -180,7 +145,7 @@ def test_valid_reinforce(env, arguments):
 
 
 @fuzzed
-@given(environments(), st.fixed_dictionaries({"n_delta": st.integers(2, 5)}, optional=OF_SEARCH))
+@given(environments(), st.fixed_dictionaries({"n_delta": st.integers(2, 5)}, optional=FINITE_DIFFERENCE_STRATEGIES))
 def test_valid_search(env, arguments):
     assert_trains(FiniteDifference, env, arguments)
 

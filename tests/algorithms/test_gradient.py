@@ -55,8 +55,7 @@ def learn(n_rollouts=1, n_envs=1, truncate=False, critic_learning_rate=0.0, **kw
     with th.no_grad():
         for parameter in model.policy.parameters():
             parameter.normal_()
-    before = {name: parameter.double().numpy() for name, parameter in model.policy.state_dict().items()}
-    before = {name: parameter.copy() for name, parameter in before.items()}
+    before = {name: parameter.double().numpy().copy() for name, parameter in model.policy.state_dict().items()}
     model.learn(n_rollouts * (model.n_steps or 1) * n_envs)
     return model, before, [wrapped.unwrapped.log for wrapped in env.envs]
 
@@ -163,33 +162,21 @@ def assert_step_is(model, before, expected, scale):
 def test_the_step_is_the_formula(
     baseline, n_steps, n_episodes, normalize_by, n_rollouts, reward_to_go, truncate, n_envs
 ):
-    discount_scores = truncate == reward_to_go
     arguments = dict(
-        baseline=baseline,
-        n_steps=n_steps,
-        n_episodes=n_episodes,
-        normalize_by=normalize_by,
-        reward_to_go=reward_to_go,
-        discount_scores=discount_scores,
-    )
+        baseline=baseline, n_steps=n_steps, n_episodes=n_episodes, normalize_by=normalize_by,
+        reward_to_go=reward_to_go, discount_scores=truncate == reward_to_go,
+    )  # fmt: skip
     model, before, logs = learn(n_rollouts, n_envs, truncate, **arguments)
     assert_step_is(model, before, *formula(before, logs, n_rollouts=n_rollouts, **arguments))
 
 
-def test_the_value_baseline_is_the_critic_before_this_rollout_trained_it():
-    arguments = dict(baseline="value", n_steps=16, n_episodes=None, reward_to_go=True, discount_scores=False)
-    arguments["normalize_by"] = "steps"
-    model, before, logs = learn(1, 4, critic_learning_rate=0.5, **arguments)
-    assert_step_is(model, before, *formula(before, logs, n_rollouts=1, **arguments))
-    assert np.abs(model.policy.value_net.weight.detach().numpy() - before["value_net.weight"]).max() > 1
-
-
-@pytest.mark.parametrize("gae_lambda", [0.0, 0.9])
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.9, 1.0])
 @pytest.mark.parametrize("mode", [{"n_steps": 16, "n_episodes": None}, {"n_steps": None, "n_episodes": 9}])
-def test_the_step_is_the_formula_with_generalized_advantages(mode, gae_lambda):
+def test_the_step_is_the_formula_with_the_critic_before_this_rollout_trained_it(mode, gae_lambda):
     arguments = dict(baseline="value", reward_to_go=True, discount_scores=False, normalize_by="steps", **mode)
-    model, before, logs = learn(1, 4, True, gae_lambda=gae_lambda, **arguments)
+    model, before, logs = learn(1, 4, True, critic_learning_rate=0.5, gae_lambda=gae_lambda, **arguments)
     assert_step_is(model, before, *formula(before, logs, n_rollouts=1, lam=gae_lambda, **arguments))
+    assert np.abs(model.policy.value_net.weight.detach().numpy() - before["value_net.weight"]).max() > 1
 
 
 @pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
@@ -285,11 +272,11 @@ def test_a_pass_of_the_critic_descends_its_error(max_grad_norm):
 
 
 @pytest.mark.parametrize("n", [1, 3, 32, 777])
-def test_weights_that_do_not_differ_are_not_standardize(n):
-    """Their deviation is 0 but for rounding, which must not be blown up."""
+def test_standardized_weights(n):
+    """Divided by their deviation, not its square, unless it is 0 but for rounding, which must not be blown up."""
     same = th.full((n,), 123.4567)
     assert th.equal(standardize(same), same)
-    assert standardize(th.tensor([1.0, 3.0])).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
+    assert standardize(th.tensor([1.0, 7.0])).tolist() == pytest.approx([-(0.5**0.5), 0.5**0.5])
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.5, 3.0])

@@ -4,8 +4,7 @@ import pytest
 import torch as th
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.baselines import BASELINES, leave_one_out, mean, none, time_mean
-from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation import BASELINES, Rollout, leave_one_out, mean, none, time_mean
 
 
 def make_rollout(returns, dones, timesteps, used=None, policy=None):
@@ -26,37 +25,31 @@ def make_rollout(returns, dones, timesteps, used=None, policy=None):
     )
 
 
-@pytest.fixture
-def two_environments():
-    """Three episodes: of 3 steps on the left, of 1 and 2 steps on the right; the last step on the right is not used."""
-    return make_rollout(
-        returns=[[10, 1], [20, 4], [30, 100]],
-        dones=[[0, 1], [0, 0], [1, 0]],
-        timesteps=[[0, 0], [1, 0], [2, 1]],
-        used=[[1, 1], [1, 1], [1, 0]],
-    )
+# Three episodes: of 3 steps on the left, of 1 and 2 steps on the right; the last step on the right is not used
+GRID = make_rollout(
+    returns=[[10, 1], [20, 4], [30, 100]],
+    dones=[[0, 1], [0, 0], [1, 0]],
+    timesteps=[[0, 0], [1, 0], [2, 1]],
+    used=[[1, 1], [1, 1], [1, 0]],
+)
 
 
-def test_episodes_are_numbered(two_environments):
-    assert two_environments.episodes.tolist() == [[0, 1], [0, 2], [0, 2]]
+def test_episodes_are_numbered():
+    assert GRID.episodes.tolist() == [[0, 1], [0, 2], [0, 2]]
 
 
-def test_none_is_zero(two_environments):
-    assert none(two_environments).tolist() == [[0, 0]] * 3
-
-
-def test_mean_pools_all_used_steps(two_environments):
-    assert mean(two_environments)[two_environments.used].tolist() == [13.0] * 5
-
-
-def test_time_mean_averages_over_the_episodes_that_reach_t(two_environments):
-    ours = time_mean(two_environments)
-    assert ours[0].tolist() == [5, 5] and ours[1].tolist() == [20, 5] and ours[2, 0] == 30
-
-
-def test_leave_one_out_averages_over_the_other_ones(two_environments):
-    ours = leave_one_out(two_environments)
-    assert ours[0].tolist() == [2.5, 7] and ours[1].tolist() == [0, 5.5] and ours[2, 0] == 0
+@pytest.mark.parametrize(
+    ("baseline", "expected"),
+    [
+        (none, [0, 0, 0, 0, 0]),
+        (mean, [13, 13, 13, 13, 13]),
+        (time_mean, [5, 5, 20, 5, 30]),
+        (leave_one_out, [2.5, 7, 0, 5.5, 0]),
+    ],
+)
+def test_a_baseline_averages_over_used_steps(baseline, expected):
+    """All of them, those of the episodes that reach t, or those of the other episodes that do."""
+    assert baseline(GRID)[GRID.used].tolist() == expected
 
 
 def test_a_timestep_that_one_episode_reaches_has_a_defined_weight():

@@ -1,9 +1,4 @@
-"""
-The expected gradient by exact enumeration: the sum over all batches of N episodes of their probability times ĝ.
-
-The policy is a softmax over a table, in float64; the batch goes through the package's own returns, baselines and
-denominators. ∇E[G_0] comes from autograd through the probabilities of the trajectories.
-"""
+"""The expected gradient by exact enumeration against ∇E[G_0], for each baseline and each option."""
 
 from functools import partial
 from itertools import product

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_reinforce.estimation.estimators import (
+from sb3_reinforce.estimation import (
     ESTIMATORS,
     Utility,
     central_difference,
     fit_quality,
     forward_difference,
+    gaussian,
     regression_gradient,
 )
-from sb3_reinforce.estimation.perturbations import gaussian
 
 N = 5
 SEEDS = pytest.mark.parametrize("seed", range(20))
@@ -109,12 +109,9 @@ def test_n_top_is_the_central_difference_of_the_best_perturbations() -> None:
         return x.exp().sum(-1)
 
     best = th.maximum(utility(deltas), utility(-deltas)).argsort(descending=True)[:2]
-    th.testing.assert_close(
-        central_difference(utility, theta, deltas, n_top=2), central_difference(utility, theta, deltas[best])
-    )
-    th.testing.assert_close(
-        central_difference(utility, theta, deltas, n_top=6), central_difference(utility, theta, deltas)
-    )
+    for n_top, rows in ((2, deltas[best]), (6, deltas)):
+        estimate = central_difference(utility, theta, deltas, n_top=n_top)
+        th.testing.assert_close(estimate, central_difference(utility, theta, rows))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -127,7 +124,7 @@ def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(nam
         ESTIMATORS[name](utility, th.zeros(N).double(), equal)
 
 
-def test_fit_quality_is_that_of_a_textbook_regression() -> None:
+def test_fit_quality_is_a_textbook_regressions() -> None:
     m = 400
     slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]
     utilities = 3 + deltas @ slope + 0.5 * noise

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_reinforce.estimation.perturbations import PERTURBATIONS, coordinate, rademacher, sphere
+from sb3_reinforce.estimation import PERTURBATIONS, coordinate, rademacher, sphere
 
 
 def generator(seed: int = 0) -> th.Generator:
@@ -34,7 +34,7 @@ def test_norms() -> None:
     assert set(rademacher(9, 6, generator()).unique().tolist()) == {-1.0, 1.0}
 
 
-def test_coordinates_pass_through_all_parameters_with_alternating_sign() -> None:
+def test_coordinates_visit_all_parameters_with_alternating_sign() -> None:
     deltas = coordinate(10, 4, generator())
     for rows, sign in ((deltas[:4], 1), (deltas[4:8], -1)):
         th.testing.assert_close(rows.abs().sum(0), th.ones(4).double())

@@ -14,12 +14,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.estimation import gradients_by_episode
 
-ACTION_SPACES = [
-    spaces.Discrete(3),
-    spaces.Box(-1, 1, (2,)),
-    spaces.MultiDiscrete([2, 3]),
-    spaces.MultiBinary(2),
-]
+BOX = spaces.Box(-1, 1, (2,))
 
 
 def collect(env, policy="MlpPolicy", n_episodes=5, **kwargs):
@@ -57,30 +52,14 @@ def assert_as_one_by_one(rollout, **kwargs):
     th.testing.assert_close(part, together[..., 3:6])
 
 
-@pytest.mark.parametrize("action_space", ACTION_SPACES)
+@pytest.mark.parametrize(
+    "action_space", [spaces.Discrete(3), BOX, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], ids=str
+)
 @pytest.mark.parametrize("chunk", [1, 2**25])
 def test_every_action_space_and_any_memory(action_space, chunk):
     """Short and long episodes, in environments that go on after their quota."""
     env = make_vec_env(lambda: Corridor((1, 7, 259), action_space=action_space), 2, seed=0)
     assert_as_one_by_one(collect(env), chunk=chunk)
-
-
-@pytest.mark.parametrize("kwargs", [{"temperature": 0.3}, {"policy_kwargs": {"net_arch": [8, 8], "ortho_init": False}}])
-def test_other_mlp_policies(kwargs):
-    assert_as_one_by_one(collect(Corridor((2, 9)), **kwargs))
-
-
-def test_gsde():
-    assert_as_one_by_one(collect(Corridor((2, 9), action_space=spaces.Box(-1, 1, (2,))), use_sde=True))
-
-
-def test_images():
-    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=True)
-    assert_as_one_by_one(collect(env, "CnnPolicy", n_episodes=2))
-
-
-def test_dict_observations():
-    assert_as_one_by_one(collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2))
 
 
 class Branching(ActorCriticPolicy):
@@ -91,8 +70,20 @@ class Branching(ActorCriticPolicy):
         return values, log_prob * (2.0 if float(obs.sum()) > 0 else 1.0), entropy
 
 
-def test_a_policy_with_a_method_that_branches():
-    assert_as_one_by_one(collect(Corridor((2, 9)), Branching))
+IMAGES = {"screen_height": 36, "screen_width": 36, "n_channels": 1, "discrete": True}
+POLICIES = {
+    "temperature": lambda: collect(Corridor((2, 9)), temperature=0.3),
+    "net_arch": lambda: collect(Corridor((2, 9)), policy_kwargs={"net_arch": [8, 8], "ortho_init": False}),
+    "gSDE": lambda: collect(Corridor((2, 9), action_space=BOX), use_sde=True),
+    "images": lambda: collect(FakeImageEnv(**IMAGES), "CnnPolicy", n_episodes=2),
+    "dicts": lambda: collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2),
+    "a method that branches": lambda: collect(Corridor((2, 9)), Branching),
+}
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_policy(name):
+    assert_as_one_by_one(POLICIES[name]())
 
 
 class Detached(ActorCriticPolicy):
@@ -112,7 +103,7 @@ def test_a_policy_without_a_gradient_is_named():
 
 @pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "action_net.bias", "log_std"])
 def test_frozen_parameters_have_no_gradient(frozen):
-    rollout = collect(Corridor((2, 9), action_space=spaces.Box(-1, 1, (2,))))
+    rollout = collect(Corridor((2, 9), action_space=BOX))
     whole = gradients_by_episode(rollout, rollout.returns).shape[-1]
     parameter = rollout.policy.get_parameter(frozen).requires_grad_(False)
     assert gradients_by_episode(rollout, rollout.returns).shape[-1] == whole - parameter.numel()

@@ -15,29 +15,25 @@ from sb3_reinforce.policies.evaluation import evaluate, route_of
 from sb3_reinforce.policies.plain_mlp import plain_critic
 
 N_STEPS, N_ENVS = 7, 3
+MODES = [{"baseline": "value", "n_steps": 10}, {"baseline": "none", "n_steps": None, "n_episodes": N_ENVS}]
 
 
-class OwnCritic(ActorCriticPolicy):
-    """The same values, by a method of its own."""
+def overriding(policy_class):
+    """The same policy with a ``predict_values`` of the user, which computes the same."""
 
-    def predict_values(self, obs):
-        return super().predict_values(obs)
+    class Own(policy_class):
+        def predict_values(self, obs):
+            return super().predict_values(obs)
 
-
-class OwnCnnCritic(ActorCriticCnnPolicy):
-    """The same values, by a method of its own."""
-
-    def predict_values(self, obs):
-        return super().predict_values(obs)
+    return Own
 
 
-OWN = {"MlpPolicy": OwnCritic, "CnnPolicy": OwnCnnCritic}
+both_policies = pytest.mark.parametrize("policy", [ActorCriticPolicy, ActorCriticCnnPolicy])
 
 
-def make(policy, **kwargs):
-    is_image = policy == "CnnPolicy" or (isinstance(policy, type) and issubclass(policy, ActorCriticCnnPolicy))
-    image = {"screen_height": 36, "screen_width": 36}
-    env = make_vec_env(FakeImageEnv if is_image else Corridor, N_ENVS, 0, env_kwargs=image if is_image else {})
+def make(policy=ActorCriticPolicy, **kwargs):
+    is_image = issubclass(policy, ActorCriticCnnPolicy)
+    env = make_vec_env(lambda: FakeImageEnv(screen_height=36, screen_width=36) if is_image else Corridor(), N_ENVS, 0)
     return REINFORCE(policy, env, **{"n_steps": N_STEPS, "seed": 0, "device": "cpu", **kwargs})
 
 
@@ -47,7 +43,12 @@ def observations(buffer):
 
 @pytest.mark.parametrize(
     ("policy", "kwargs"),
-    [("MlpPolicy", {}), ("MlpPolicy", {"activation_fn": th.nn.ReLU}), ("CnnPolicy", {}), (OwnCnnCritic, {})],
+    [
+        (ActorCriticPolicy, {}),
+        (ActorCriticPolicy, {"activation_fn": th.nn.ReLU}),
+        (ActorCriticCnnPolicy, {}),
+        (overriding(ActorCriticCnnPolicy), {}),
+    ],
 )
 def test_values_are_the_policys(policy, kwargs):
     """From plain layers, along with the actions, or in one batch."""
@@ -60,11 +61,11 @@ def test_values_are_the_policys(policy, kwargs):
 
 
 @pytest.mark.parametrize("share", [True, False])
-@pytest.mark.parametrize("policy", OWN)
+@both_policies
 def test_a_kept_features_extractor_gives_the_same_critic(policy, share):
     """As many passes over the same data, from kept features and from the observations."""
     kwargs = {"policy_kwargs": {"share_features_extractor": share}}
-    short, long = make(policy, **kwargs), make(OWN[policy], **kwargs)
+    short, long = make(policy, **kwargs), make(overriding(policy), **kwargs)
     obs, returns = observations(short.learn(1).rollout_buffer), th.randn(N_STEPS * N_ENVS)
     long.policy.load_state_dict(short.policy.state_dict())
     fitted = []
@@ -81,67 +82,60 @@ def test_a_kept_features_extractor_gives_the_same_critic(policy, share):
     assert not th.equal(fitted[0][0], make(policy, **kwargs).policy.value_net.weight)
 
 
-@pytest.mark.parametrize("baseline", ["value", "none"])
-def test_how_often_a_shared_features_extractor_is_evaluated(baseline):
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_how_often_a_shared_features_extractor_is_evaluated(mode):
     """For each step and for the policy's; with a critic for its passes and the last observations."""
-    mode = {"n_steps": 10} if baseline == "value" else {"n_steps": None, "n_episodes": N_ENVS}
-    model = make("CnnPolicy", baseline=baseline, n_critic_updates=5, **mode)
-    model.learn(1)
+    model = make(ActorCriticCnnPolicy, n_critic_updates=5, **mode).learn(1)
     calls = []
     model.policy.features_extractor.register_forward_hook(lambda *args: calls.append(1))
     model.learn(1)
     n_steps = 10  # the length of every episode, which a time limit ends
-    assert len(calls) == n_steps + 1 + (1 + 2 if baseline == "value" else 0)
+    assert len(calls) == n_steps + 1 + (1 + 2 if mode["baseline"] == "value" else 0)
 
 
 class ActionZero(ActorCriticCnnPolicy):
-    """Its own way to the actions."""
-
     def get_distribution(self, obs):
         logits = super().get_distribution(obs).distribution.logits
         return self.action_dist.proba_distribution(logits + 1e3 * th.eye(logits.shape[1])[0])
 
 
-@pytest.mark.parametrize("baseline", ["value", "none"])
-def test_a_policys_own_distribution_is_used_with_a_shared_features_extractor(baseline):
-    mode = {"n_steps": 8} if baseline == "value" else {"n_steps": None, "n_episodes": N_ENVS}
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_a_policys_own_distribution_is_used_with_a_shared_features_extractor(mode):
     # Log-probabilities are computed for callbacks
-    model = make(ActionZero, baseline=baseline, **mode).learn(8, callback=lambda *_: True)
+    model = make(ActionZero, **mode).learn(8, callback=lambda *_: True)
     assert (model.rollout_buffer.actions == 0).all()
     np.testing.assert_allclose(model.rollout_buffer.log_probs, 0, atol=1e-6)
 
 
-def changed(name):
-    policy = make("MlpPolicy").policy
-    if name == "method":
-        policy.predict_values = lambda obs: th.full((len(obs), 1), 3.0)
-    elif name == "class":
-        policy.__class__ = OwnCritic
-    elif name == "hook":
-        policy.mlp_extractor.value_net.register_forward_hook(lambda module, inputs, output: output + 1)
-    elif name == "no bias":
-        policy.value_net.bias = None
-    elif name == "tied":
-        net = policy.mlp_extractor.value_net
-        net.extend([th.nn.Linear(64, 64), th.nn.Linear(64, 64)])
-        net[-1].bias = net[-2].bias
-    return policy
+def tie(policy):
+    net = policy.mlp_extractor.value_net
+    net.extend([th.nn.Linear(64, 64), th.nn.Linear(64, 64)])
+    net[-1].bias = net[-2].bias
 
 
-@pytest.mark.parametrize("name", ["as it is", "method", "class", "hook", "no bias", "tied"])
-def test_a_critic_that_the_user_has_changed_is_asked_itself(name):
-    policy, model = changed(name), make("MlpPolicy").learn(1)
+CHANGES = {
+    "none": lambda policy: None,
+    "method": lambda policy: setattr(policy, "predict_values", lambda obs: th.full((len(obs), 1), 3.0)),
+    "class": lambda policy: setattr(policy, "__class__", overriding(ActorCriticPolicy)),
+    "hook": lambda policy: policy.mlp_extractor.value_net.register_forward_hook(lambda module, x, output: output + 1),
+    "no bias": lambda policy: setattr(policy.value_net, "bias", None),
+    "tied": tie,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_critic_that_the_user_has_changed_is_evaluated_as_it_is(change):
+    policy, buffer = make().policy, make().learn(1).rollout_buffer
+    CHANGES[change](policy)
     with th.no_grad():
-        expected = policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
-    np.testing.assert_allclose(
-        values_along(policy, route_of(policy, True), model.rollout_buffer), expected, rtol=1e-5, atol=1e-6
-    )
-    assert (plain_critic(policy) is not None) == (name in ("as it is", "tied"))
+        expected = policy.predict_values(observations(buffer)).reshape(N_STEPS, N_ENVS)
+    np.testing.assert_allclose(values_along(policy, route_of(policy, True), buffer), expected, rtol=1e-5, atol=1e-6)
+    assert (plain_critic(policy) is not None) == (change in ("none", "tied"))
 
 
 def test_a_hook_on_a_parameter_of_the_critic_is_called():
     """Users mask gradients with them."""
-    model = make("MlpPolicy", n_critic_updates=3)
+    model = make(n_critic_updates=3)
     before = model.policy.value_net.weight.detach().clone()
     model.policy.value_net.weight.register_hook(th.zeros_like)
     model.learn(1)
@@ -157,20 +151,20 @@ class Dropping(FlattenExtractor):
 
 @pytest.mark.parametrize("share", [True, False])
 def test_only_an_extractor_that_does_not_move_is_kept(share):
-    """Dropout draws anew for each pass of a critic's own extractor; one that the actor shares is in evaluation mode."""
+    """Dropout draws other masks in each pass; an extractor that the actor shares is in evaluation mode."""
     kwargs = {"features_extractor_class": Dropping, "share_features_extractor": share}
-    model, modes = make("MlpPolicy", policy_kwargs=kwargs, n_critic_updates=3, batch_size=100), []
-    hook = lambda module, *args: modes.append(module.training)  # noqa: E731
-    model.policy.vf_features_extractor.register_forward_hook(hook)
+    model, modes = make(policy_kwargs=kwargs, n_critic_updates=3, batch_size=100), []
+    extractor = model.policy.vf_features_extractor
+    extractor.register_forward_hook(lambda module, *args: modes.append(module.training))
     model.learn(1)
     # The last rows: three passes of the critic, or one for all of them
     assert modes[-3:] == [True] * 3 if not share else modes[-2:] == [True, False]
 
 
-@pytest.mark.parametrize("policy", OWN)
+@both_policies
 def test_values_of_the_policy_step_are_those_of_predict_values(policy):
-    """Also where that is the user's own, and the extractor is shared."""
-    own = type("Own", (OWN[policy],), {"predict_values": lambda self, obs: th.full((len(obs), 1), 3.0)})
+    """Also if the user overrides it and the extractor is shared."""
+    own = type("Own", (policy,), {"predict_values": lambda self, obs: th.full((len(obs), 1), 3.0)})
     model = make(own).learn(1)
     obs = observations(model.rollout_buffer)
     assert (

@@ -1,16 +1,18 @@
 """The NumPy actor is the policy: the same function of the observation, the same actions for the same seed."""
 
+from operator import attrgetter
+
 import numpy as np
 import pytest
 import torch as th
+from callbacks import At
 from environments import Corridor
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
@@ -58,7 +60,7 @@ def test_the_same_seed_gives_the_same_actions(space, kwargs, activation_fn, n_en
 
 
 class OwnForward(ActorCriticPolicy):
-    """Plain, but by a method of its own, so that nothing is replaced."""
+    """Plain, but with a method of the user, so that nothing is replaced."""
 
     def forward(self, obs, deterministic=False):
         return super().forward(obs, deterministic)
@@ -74,107 +76,68 @@ def test_a_run_does_not_depend_on_the_path(space):
     th.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
 
 
-def scale(module, factor=-20):
-    """A hook that turns a module's preferences around."""
-    module.register_forward_hook(lambda module, inputs, output: output * factor)
+def override_in_class(thing, *names):
+    """Give the methods of a subclass −20 times their argument, which turns the preferences around."""
+    cls = type(thing)
+    methods = {
+        name: lambda self, action_logits, *args, name=name: getattr(cls, name)(self, action_logits * -20, *args)
+        for name in names
+    }
+    thing.__class__ = type(f"Own{cls.__name__}", (cls,), methods)
 
 
-class Scaled(th.nn.Sequential):
-    def forward(self, x):
-        return super().forward(x) * -20
+def override_in_instance(thing, *names):
+    """As in a class, but for this one object."""
+    for name in names:
+        method = getattr(thing, name)
+        setattr(thing, name, lambda action_logits, *args, method=method: method(action_logits * -20, *args))
 
 
-class Certain(CategoricalDistribution):
-    def proba_distribution(self, action_logits):
-        return super().proba_distribution(action_logits * -20)
+def hook(module):
+    """Turn the preferences of a module around."""
+    module.register_forward_hook(lambda module, inputs, output: output * -20)
 
 
-class OwnLatent(ActorCriticPolicy):
-    def _get_action_dist_from_latent(self, latent_pi):
-        return super()._get_action_dist_from_latent(latent_pi * -20)
+METHODS = {
+    "": ("extract_features", "get_distribution evaluate_actions", "_get_action_dist_from_latent"),
+    "features_extractor": ("forward",),
+    "mlp_extractor": ("forward_actor",),
+    "mlp_extractor.policy_net": ("forward",),
+    "action_net": ("forward",),
+    "action_dist": ("proba_distribution",),
+}
+HOOKED = (
+    *("action_net", "mlp_extractor.policy_net", "mlp_extractor.policy_net.0"),
+    *("features_extractor", "features_extractor.flatten"),
+)
 
 
-class OwnDistribution(ActorCriticPolicy):
-    def get_distribution(self, obs):
-        return self.action_dist.proba_distribution(super().get_distribution(obs).distribution.logits * -20)
-
-    def evaluate_actions(self, obs, actions):
-        distribution = self.get_distribution(obs)
-        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
-
-
-class OwnExtractor(FlattenExtractor):
-    def forward(self, observations):
-        return super().forward(observations) * -20
-
-
-class OwnMlp(MlpExtractor):
-    def forward_actor(self, features):
-        return super().forward_actor(features) * -20
-
-
-class OwnFeatures(ActorCriticPolicy):
-    def extract_features(self, obs, features_extractor=None):
-        return super().extract_features(obs, features_extractor) * -20
-
-
-class OwnLinear(th.nn.Linear):
-    def forward(self, x):
-        return super().forward(x) * -20
-
-
-def own_body(policy):
-    policy.mlp_extractor.policy_net = Scaled(*policy.mlp_extractor.policy_net)
-
-
-def own_layer(policy):
-    policy.action_net.__class__ = OwnLinear
-
-
-def own_forward(policy):
-    action_net = policy.action_net.forward
-    policy.action_net.forward = lambda x: action_net(x) * -20
-
-
-def own_method(policy):
-    method = policy._get_action_dist_from_latent
-    policy._get_action_dist_from_latent = lambda latent: method(latent * -20)
-
-
-def own_distribution(policy):
-    proba_distribution = policy.action_dist.proba_distribution
-    policy.action_dist.proba_distribution = lambda action_logits: proba_distribution(action_logits * -20)
+def part(policy, path):
+    return attrgetter(path)(policy) if path else policy
 
 
 CHANGES = {
-    "as it is": lambda policy: None,
-    "class": lambda policy: setattr(policy, "__class__", OwnLatent),
-    "features": lambda policy: setattr(policy, "__class__", OwnFeatures),
-    "distribution of the class": lambda policy: setattr(policy, "__class__", OwnDistribution),
-    "extractor": lambda policy: setattr(policy.features_extractor, "__class__", OwnExtractor),
-    "mlp extractor": lambda policy: setattr(policy.mlp_extractor, "__class__", OwnMlp),
-    "method": own_method,
-    "distribution": lambda policy: setattr(policy, "action_dist", Certain(2)),
-    "hook on the head": lambda policy: scale(policy.action_net),
-    "hook on the body": lambda policy: scale(policy.mlp_extractor.policy_net),
-    "hook on a layer": lambda policy: scale(policy.mlp_extractor.policy_net[0]),
-    "hook on the extractor": lambda policy: scale(policy.features_extractor),
+    f"{override.__name__}: {path} {names}": lambda policy, override=override, path=path, names=names: override(
+        part(policy, path), *names.split()
+    )
+    for override in (override_in_class, override_in_instance)
+    for path, methods in METHODS.items()
+    for names in methods
+}
+CHANGES |= {f"hook on {path}": lambda policy, path=path: hook(part(policy, path)) for path in HOOKED}
+CHANGES |= {
     "pre-hook": lambda policy: policy.action_net.register_forward_pre_hook(lambda module, x: (x[0] * -20,)),
-    "body": own_body,
-    "layer": own_layer,
-    "forward": own_forward,
-    "hook on the flatten": lambda policy: scale(policy.features_extractor.flatten),
+}
+# These do not turn the preferences around
+SLIGHT = {
+    "none": lambda policy: None,
     "hook on the policy": lambda policy: policy.register_forward_hook(lambda module, inputs, output: output),
-    "forward of the mlp extractor": lambda policy: setattr(
-        policy.mlp_extractor, "forward_actor", lambda features: policy.mlp_extractor.policy_net(features) * -20
-    ),
-    "distribution of the instance": own_distribution,
     "no bias": lambda policy: setattr(policy.action_net, "bias", None),
     "gelu": lambda policy: policy.mlp_extractor.policy_net.append(th.nn.GELU()),
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("change", [*CHANGES, *SLIGHT])
 def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
     """Otherwise the gradient would be that of another policy than the one that acts."""
     policy = make_policy(spaces.Discrete(2))
@@ -185,40 +148,45 @@ def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
             return policy.evaluate_actions(obs_as_tensor(obs[:1], "cpu"), th.ones(1))[1].exp().item()
 
     before = probability()
-    CHANGES[change](policy)
+    (CHANGES | SLIGHT)[change](policy)
     actor, expected = actor_of(policy, N_DRAWS), probability()
     share = actor.act(obs)[0].mean()
     assert share == pytest.approx(expected, abs=4 * 0.5 / N_DRAWS**0.5)
-    assert isinstance(actor, NumpyActor) == (change == "as it is") and abs(before - expected) < 1
-    assert change in ("as it is", "no bias", "gelu", "hook on the policy") or abs(before - expected) > 0.2
+    assert isinstance(actor, NumpyActor) == (change == "none") and abs(before - expected) < 1
+    assert change in SLIGHT or abs(before - expected) > 0.2
 
 
-def is_fast(policy):
-    return isinstance(actor_of(policy, 2), NumpyActor)
-
-
-def test_whatever_is_not_plain_goes_the_general_way():
-    assert is_fast(make_policy())
-    assert not is_fast(make_policy(policy_kwargs={"activation_fn": th.nn.ELU}))
-    assert plain_actor(make_policy(SPACES[3], use_sde=True)) is None
-    assert plain_actor(make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True)) is None
+def test_a_policy_that_is_not_plain_acts_by_its_own_methods():
+    images = FakeImageEnv(screen_height=36, screen_width=36)  # scaled to [0, 1] before they are flattened
+    policies = [
+        make_policy(policy_kwargs={"activation_fn": th.nn.ELU}),
+        make_policy(SPACES[3], use_sde=True),
+        make_policy(SPACES[3], policy_kwargs={"squash_output": True}, use_sde=True),
+        REINFORCE("MlpPolicy", images, device="cpu").policy,
+    ]
+    assert type(policies[-1].features_extractor) is FlattenExtractor
+    assert not any(isinstance(actor_of(policy, 2), NumpyActor) for policy in policies)
     assert plain_actor(th.compile(make_policy(), backend="eager")) is None
 
 
-@pytest.mark.parametrize("name", ["mlp_extractor.policy_net.2", "action_net"])
-@pytest.mark.parametrize("hook", ["register_full_backward_hook", "register_full_backward_pre_hook"])
-def test_backward_hooks_are_called(name, hook):
+@pytest.mark.parametrize(
+    ("register", "module", "least"),
+    [
+        ("register_full_backward_hook", "mlp_extractor.policy_net.2", 1),
+        ("register_full_backward_hook", "action_net", 1),
+        ("register_full_backward_pre_hook", "mlp_extractor.policy_net.2", 1),
+        ("register_full_backward_pre_hook", "action_net", 1),
+        ("register_forward_hook", "", 8),
+        ("register_forward_hook", "mlp_extractor", 8),
+        ("register_forward_hook", "features_extractor.flatten", 8),
+    ],
+)
+def test_hooks_are_called_as_in_a2c(register, module, least):
     """Users log gradients with them."""
     model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
-    getattr(model.policy.get_submodule(name), hook)(lambda *args: calls.append(1))
+    getattr(model.policy.get_submodule(module), register)(lambda *args: calls.append(1))
     model.learn(8)
-    assert calls
-
-
-def test_images_go_the_general_way():
-    """They are scaled to [0, 1] before they are flattened."""
-    model = REINFORCE("MlpPolicy", FakeImageEnv(screen_height=36, screen_width=36), device="cpu")
-    assert type(model.policy.features_extractor) is FlattenExtractor and not is_fast(model.policy)
+    assert len(calls) >= least
 
 
 def test_a_squashed_gaussian_is_squashed():
@@ -228,39 +196,12 @@ def test_a_squashed_gaussian_is_squashed():
     assert np.abs(actions).max() < 1
 
 
-def test_each_rollout_acts_with_the_parameters_of_the_last_update():
-    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=20, learning_rate=0.0, seed=0)
-    model.learn(20)
-    with th.no_grad():
-        model.policy.action_net.bias.copy_(th.tensor([-100.0, 100.0]))
-    model.learn(20)
-    assert (model.rollout_buffer.actions == 1).all()
-
-
-@pytest.mark.parametrize("module", ["", "mlp_extractor", "features_extractor.flatten"])
-def test_forward_hooks_are_called_as_in_a2c(module):
-    model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
-    model.policy.get_submodule(module).register_forward_hook(lambda *args: calls.append(1))
-    model.learn(8)
-    assert len(calls) >= 8
-
-
-class Change(BaseCallback):
-    """Changes the policy so that it only takes action 1, after the tenth step."""
-
-    def __init__(self, how):
-        super().__init__()
-        self.how = how
-
-    def _on_step(self):
-        if self.n_calls == 10:
-            self.how(self.model)
-        return True
+OFFSET = th.tensor([-100.0, 100.0])
 
 
 def prefer(policy):
     with th.no_grad():
-        policy.action_net.bias.copy_(th.tensor([-100.0, 100.0]))
+        policy.action_net.bias.copy_(OFFSET)
 
 
 def new_policy(model):
@@ -274,20 +215,20 @@ def new_layer(model):
 
 
 def new_memory(model):
-    model.policy.action_net.bias.data = th.tensor([-100.0, 100.0])
+    model.policy.action_net.bias.data = OFFSET.clone()
 
 
 def new_parameter(model):
-    model.policy.action_net.bias = th.nn.Parameter(th.tensor([-100.0, 100.0]))
+    model.policy.action_net.bias = th.nn.Parameter(OFFSET.clone())
 
 
 def new_hook(model):
-    model.policy.action_net.register_forward_hook(lambda module, inputs, logits: logits + th.tensor([-100.0, 100.0]))
+    model.policy.action_net.register_forward_hook(lambda module, inputs, logits: logits + OFFSET)
 
 
 def new_method(model):
     layer = model.policy.action_net
-    layer.forward = lambda x: type(layer).forward(layer, x) + th.tensor([-100.0, 100.0])
+    layer.forward = lambda x: type(layer).forward(layer, x) + OFFSET
 
 
 HOWS = [lambda model: prefer(model.policy), new_policy, new_layer, new_memory, new_parameter, new_hook, new_method]
@@ -297,7 +238,7 @@ HOWS = [lambda model: prefer(model.policy), new_policy, new_layer, new_memory, n
 def test_a_policy_that_a_callback_changes_acts_differently_at_once(how):
     """As with A2C, not only from the next rollout on."""
     model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=40, learning_rate=0.0, seed=0, device="cpu")
-    model.learn(40, callback=Change(how))
+    model.learn(40, callback=At(10, how))
     actions = model.rollout_buffer.actions.ravel()
     assert 0 in actions[:10] and (actions[10:] == 1).all()
     log_probs = model.rollout_buffer.log_probs.ravel()

@@ -1,34 +1,20 @@
-"""What is collected: quotas, cuts, time limits, the buffer, the counts."""
+"""What is collected: quotas, cuts, time limits, the buffer."""
+
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from callbacks import Record
 from environments import Corridor
-from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.sampling.collection import Extent
+from sb3_reinforce.estimation import BASELINES
 
 CUTS = "ignore:Episodes that n_steps cuts"
-
-
-class Keep(BaseCallback):
-    """Keeps a copy of what a function of the model says at the end of each rollout."""
-
-    def __init__(self, function):
-        super().__init__()
-        self.function, self.kept = function, []
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_end(self):
-        self.kept.append(self.function(self.model))
 
 
 def make_model(env, n_envs=1, **kwargs):
@@ -36,44 +22,25 @@ def make_model(env, n_envs=1, **kwargs):
 
 
 @pytest.mark.parametrize(("n_episodes", "n_envs"), [(1, 1), (7, 3), (3, 7), (8, 4)])
-def test_the_quotas_sum_to_n_episodes_and_differ_by_at_most_one(n_episodes, n_envs):
-    quota = Extent.whole_episodes(n_episodes, n_envs, 10).quota
-    assert quota.sum() == n_episodes and np.ptp(quota) <= 1
+def test_episodes_are_shared_out_evenly_and_begin_with_the_rollout(n_episodes, n_envs):
+    model = make_model(lambda: Corridor((2, 9)), n_envs, n_episodes=n_episodes, baseline="none")
+    rollouts = Record(lambda model: model.rollout)
+    model.learn(100, callback=rollouts)
+    for rollout in rollouts.records:
+        quota = (rollout.used & rollout.dones).sum(0)
+        assert quota.sum() == n_episodes and quota.max() - quota.min() <= 1
+        assert rollout.timesteps[0].tolist() == [0] * n_envs
 
 
 def test_lengths_of_used_episodes_are_drawn_without_bias():
     """Lengths of 1 and 100: "the first to finish" would use far more short ones than half."""
-    env = make_vec_env(lambda: Corridor((1, 100)), 4, seed=0)
-    model = REINFORCE("MlpPolicy", env, n_episodes=6, baseline="none", seed=0, device="cpu", learning_rate=0.0)
-    keep = Keep(lambda model: model.rollout.used.sum().item())
-    model.learn(80_000, callback=keep)
-    n_episodes = 6 * len(keep.kept)
+    model = make_model(lambda: Corridor((1, 100)), 4, n_episodes=6, baseline="none", learning_rate=0.0)
+    n_used = Record(lambda model: model.rollout.used.sum().item())
+    model.learn(80_000, callback=n_used)
+    n_episodes = 6 * len(n_used.records)
     mean, std = 50.5, 49.5
     assert n_episodes > 500
-    assert abs(sum(keep.kept) / n_episodes - mean) < 3 * std / np.sqrt(n_episodes)
-
-
-def test_logged_episodes_are_those_that_are_used():
-    """What an environment does beyond its quota would fill the statistics with short episodes."""
-    env = make_vec_env(lambda: Corridor((1, 100)), 4, seed=0)
-    model = REINFORCE("MlpPolicy", env, n_episodes=4, baseline="none", seed=0, device="cpu")
-    model.learn(1)
-    assert len(model.ep_info_buffer) == 4
-
-
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_whole_episodes_count_every_step_and_start_anew(n_envs):
-    model = make_model(lambda: Corridor((2, 9)), n_envs, n_episodes=5, baseline="none")
-    keep = Keep(lambda model: (model.rollout_buffer.size(), model.rollout.timesteps[0].tolist()))
-    model.learn(300, callback=keep)
-    assert model.num_timesteps == n_envs * sum(size for size, _ in keep.kept)
-    assert all(first == [0] * n_envs for _, first in keep.kept)
-
-
-@pytest.mark.parametrize("n_envs", [1, 4])
-def test_fixed_rollouts_count_exactly(n_envs):
-    model = make_model("CartPole-v1", n_envs, n_steps=16).learn(16 * n_envs * 3)
-    assert model.num_timesteps == 16 * n_envs * 3 and model._n_updates == 3
+    assert abs(sum(n_used.records) / n_episodes - mean) < 3 * std / np.sqrt(n_episodes)
 
 
 @pytest.mark.filterwarnings(CUTS)
@@ -118,71 +85,49 @@ def test_without_a_critic_the_value_network_changes_nothing(baseline, mode, trun
     for value in (0.0, 1e6):
         model = make_model(lambda: Corridor((3, 8), truncate=truncate), 2, baseline=baseline, **mode)
         set_value_network(model, value)
-        keep = Keep(lambda model: (model.rollout_buffer.returns.copy(), model.rollout_buffer.advantages.copy()))
-        model.learn(100, callback=keep)
+        data = Record(lambda model: (model.rollout_buffer.returns.copy(), model.rollout_buffer.advantages.copy()))
+        model.learn(100, callback=data)
         actor = [parameter.clone() for parameter in model.policy.mlp_extractor.policy_net.parameters()]
-        outcomes.append((keep.kept, actor))
-    (kept, actor), (kept_too, actor_too) = outcomes
-    np.testing.assert_array_equal(kept[0], kept_too[0])
-    assert all(map(th.equal, actor, actor_too))
+        outcomes.append((data.records[0], actor))
+    (data, actor), (other_data, other_actor) = outcomes
+    np.testing.assert_array_equal(data, other_data)
+    assert all(map(th.equal, actor, other_actor))
 
 
-@pytest.mark.parametrize("method", ["predict_values", "forward_critic"])
-@pytest.mark.parametrize("baseline", [name for name in BASELINES if name != "value"])
-def test_without_a_critic_the_value_network_is_never_evaluated(baseline, method, monkeypatch):
-    model = make_model("CartPole-v1", 2, baseline=baseline, n_episodes=4)
-    owner = model.policy if method == "predict_values" else model.policy.mlp_extractor
-    monkeypatch.setattr(owner, method, None)
-    model.learn(200)
-    assert model._n_updates > 0
+class BothAtOnce(Corridor):
+    """Terminates at its time limit."""
+
+    def step(self, action):
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, terminated, terminated, info
 
 
-def constant_critic(model, value):
+@pytest.mark.parametrize(
+    ("env", "mode", "expected"),
+    [
+        (partial(Corridor, truncate=True), {"n_steps": 6}, [1, 2, 4, 1, 2, 4]),
+        (partial(Corridor, truncate=True), {"n_episodes": 2}, [1, 2, 4, 1, 2, 4]),
+        (Corridor, {"n_steps": 6}, [0] * 6),
+        (Corridor, {"n_episodes": 2}, [0] * 6),
+        (BothAtOnce, {"n_steps": 3}, [0] * 3),
+        (partial(Corridor, (100,)), {"n_steps": 3}, [1, 2, 4]),
+    ],
+)
+def test_the_critic_stands_in_at_a_cut_and_a_time_limit_and_never_after_a_terminal_step(env, mode, expected):
+    """Episodes of 3 or 100 steps, rewards 0 and V = 8: the return is 8 γ^k if the episode is cut in k steps."""
+    model = make_model(lambda: env(reward=lambda t, action: 0.0), gamma=0.5, **mode)
     with th.no_grad():
         model.policy.value_net.weight.zero_()
-        model.policy.value_net.bias.fill_(value)
-
-
-@pytest.mark.parametrize("mode", [{"n_steps": 6}, {"n_episodes": 2}])
-@pytest.mark.parametrize("truncate", [False, True])
-def test_the_critic_stands_in_at_a_time_limit_and_never_after_a_terminal_step(truncate, mode):
-    """Rewards 0 and V = 10: the return is 0 where the episode terminates, γ^k · 10 where it is cut in k steps."""
-    model = make_model(lambda: Corridor((3,), reward=lambda t, action: 0.0, truncate=truncate), gamma=0.5, **mode)
-    constant_critic(model, 10.0)
-    model.learn(6)
-    expected = [10 * 0.5**k for k in (3, 2, 1, 3, 2, 1)] if truncate else [0.0] * 6
+        model.policy.value_net.bias.fill_(8.0)
+    model.learn(len(expected))
     np.testing.assert_allclose(model.rollout_buffer.returns.ravel(), expected)
-
-
-def test_the_critic_stands_in_where_n_steps_cuts():
-    model = make_model(lambda: Corridor((100,), reward=lambda t, action: 0.0), 2, gamma=0.5, n_steps=3)
-    constant_critic(model, 8.0)
-    model.learn(6)
-    np.testing.assert_allclose(model.rollout_buffer.returns, [[1, 1], [2, 2], [4, 4]])
-
-
-def test_a_step_that_terminates_at_the_time_limit_is_terminal():
-    """Terminated and truncated at once: the state is terminal, so nothing is to be added."""
-
-    class Both(Corridor):
-        def step(self, action):
-            obs, reward, terminated, _, info = super().step(action)
-            return obs, reward, terminated, terminated, info
-
-    model = make_model(lambda: Both((3,), reward=lambda t, action: 0.0), n_steps=3)
-    constant_critic(model, 10.0)
-    model.learn(3)
-    assert model.rollout_buffer.returns.ravel().tolist() == [0, 0, 0]
 
 
 def test_the_buffer_is_that_of_a2c():
     """Also its values and log-probabilities, which are computed after the rollout, and not at each step."""
-    model = make_model("CartPole-v1", 3, n_steps=12)
-    seen = []
 
     def check(model):
         buffer = model.rollout_buffer
-        seen.append(buffer.full and buffer.size() == 12)
         obs = th.as_tensor(buffer.observations).flatten(0, 1)
         actions = th.as_tensor(buffer.actions).flatten().long()
         with th.no_grad():
@@ -190,43 +135,31 @@ def test_the_buffer_is_that_of_a2c():
         np.testing.assert_allclose(buffer.values.ravel(), values.ravel(), rtol=1e-5)
         np.testing.assert_allclose(buffer.log_probs.ravel(), log_prob, rtol=1e-5)
         np.testing.assert_allclose(buffer.advantages, buffer.returns - buffer.values, atol=1e-4)
-        assert buffer.rewards.shape == buffer.episode_starts.shape == (12, 3)
+        assert buffer.full and buffer.size() == 12 and buffer.rewards.shape == buffer.episode_starts.shape == (12, 3)
         assert next(buffer.get(batch_size=5)).observations.shape == (5, 4)
 
-    model.learn(36, callback=Keep(check))
-    assert seen == [True]
+    make_model("CartPole-v1", 3, n_steps=12).learn(36, callback=Record(check))
 
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
-@pytest.mark.parametrize("own_callback", [None, lambda *_: True])
-def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_fn, own_callback, monkeypatch):
-    """
-    The laid-out actor asks the policy nothing; the general one takes one pass more, for all log-probabilities, where a
-    callback can read them.
-    """
-    policy_kwargs = {"activation_fn": activation_fn}
-    model = make_model("CartPole-v1", 2, n_episodes=4, baseline=baseline, policy_kwargs=policy_kwargs)
-    calls = {"get_distribution": 0, "predict_values": 0}
-    for name in calls:
-        original = getattr(ActorCriticPolicy, name)
-
-        def counted(*args, name=name, original=original):
-            calls[name] += 1
-            return original(*args)
-
-        monkeypatch.setattr(ActorCriticPolicy, name, counted)
-    _, callback = model._setup_learn(1, own_callback)
-    model.collect_rollouts(model.env, callback, model.rollout_buffer, None)
-    passes = model.rollout_buffer.size() + (own_callback is not None)
-    assert calls["get_distribution"] == (0 if activation_fn is th.nn.Tanh else passes)
-    assert model.rollout_buffer.log_probs.any() == (own_callback is not None)
-    assert calls["predict_values"] <= (3 if baseline == "value" else 0)
+@pytest.mark.parametrize("callback", [None, lambda *_: True])
+def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_fn, callback, monkeypatch):
+    """The NumPy actor needs no pass of the policy; log-probabilities are computed where a callback can read them."""
+    kwargs = {"baseline": baseline, "policy_kwargs": {"activation_fn": activation_fn}}
+    model = make_model("CartPole-v1", 2, n_episodes=4, **kwargs)
+    calls = []
+    for name in ("get_distribution", "predict_values"):
+        method = partial(getattr(ActorCriticPolicy, name), model.policy)
+        counted = lambda *args, name=name, method=method: calls.append(name) or method(*args)  # noqa: E731
+        monkeypatch.setattr(ActorCriticPolicy, name, staticmethod(counted))
+    model.learn(1, callback)
+    assert calls.count("get_distribution") == (0 if activation_fn is th.nn.Tanh else model.rollout_buffer.size())
+    assert model.rollout_buffer.log_probs.any() == (callback is not None)
+    assert calls.count("predict_values") <= (3 if baseline == "value" else 0)
 
 
 class OwnForward(ActorCriticPolicy):
-    """Says in its own way what to do, and what it is worth."""
-
     def forward(self, obs, deterministic=False):
         actions, values, log_prob = super().forward(obs, deterministic)
         return th.ones_like(actions), th.full_like(values, 3.0), log_prob
@@ -237,33 +170,20 @@ def test_a_policy_that_overrides_forward_is_honoured():
     assert (model.rollout_buffer.actions == 1).all() and (model.rollout_buffer.values == 3).all()
 
 
-@pytest.mark.parametrize("space", [spaces.Discrete(3, start=5), spaces.MultiDiscrete([2, 3], start=[7, -1])])
-def test_actions_count_from_the_start_of_the_space(space):
-    """In training and in ``predict``; inside, the policy counts from 0."""
-
-    class Strict(Corridor):
-        def step(self, action):
-            assert self.action_space.contains(
-                np.asarray(action, dtype=space.dtype).reshape(space.shape) if space.shape else action
-            )
-            return super().step(action)
-
-    model = make_model(lambda: Strict((4,), action_space=space), 2, n_steps=8).learn(32)
-    assert model.rollout_buffer.actions.min() == 0
-    actions, _ = model.predict(np.zeros((50, 4), dtype=np.float32))
-    assert all(space.contains(action) for action in actions)
-
-
-def test_a_box_action_is_stored_as_drawn_and_clipped_for_the_environment():
+@pytest.mark.parametrize(
+    ("squash_output", "to_env"), [(False, lambda action: np.clip(action, -2, 2)), (True, lambda action: 2 * action)]
+)
+def test_a_box_action_is_stored_as_drawn_and_clipped_or_unscaled_for_the_environment(squash_output, to_env):
     sent = []
 
-    class Recorder(gym.ActionWrapper):
+    class Sent(gym.ActionWrapper):
         def action(self, action):
             sent.append(action)
             return action
 
-    model = make_model(lambda: Recorder(gym.make("Pendulum-v1")), n_steps=64, policy_kwargs={"log_std_init": 2.0})
-    model.learn(64)
+    policy_kwargs = {"log_std_init": 2.0, "squash_output": squash_output}
+    env = lambda: Sent(gym.make("Pendulum-v1"))  # noqa: E731
+    model = make_model(env, n_steps=64, use_sde=squash_output, policy_kwargs=policy_kwargs).learn(64)
     stored = model.rollout_buffer.actions.ravel()
-    assert np.abs(stored).max() > 2
-    np.testing.assert_allclose(np.ravel(sent), np.clip(stored, -2, 2))
+    assert squash_output or np.abs(stored).max() > 2
+    np.testing.assert_allclose(np.ravel(sent), to_env(stored), atol=1e-6)
