@@ -56,7 +56,6 @@ class EpisodicUtility:
             n_episodes,
             model.max_episode_steps,
             self._on_step,
-            model.get_vec_normalize_env(),
         )
         values = th.as_tensor(returns).mean(1)
         self.candidates.append(thetas)
