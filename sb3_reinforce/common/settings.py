@@ -57,9 +57,8 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
     if policy in known or policy in known.values():
         return
     names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
-    for name, remedy in CONTRIB_POLICIES.items():
-        if name in names:
-            raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {remedy}")
+    for name in names & CONTRIB_POLICIES.keys():
+        raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 

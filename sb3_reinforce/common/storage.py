@@ -6,7 +6,6 @@ import os
 import shutil
 import warnings
 import zipfile
-import zlib
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
@@ -14,9 +13,6 @@ from typing import Any, TypeAlias
 from stable_baselines3.common.save_util import open_path
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
-
-# What zipfile raises for bytes that have changed
-READ_ERRORS = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, zlib.error)
 
 
 def write_whole(target: PathOrFile, content: bytes) -> None:
@@ -49,21 +45,19 @@ def write_whole(target: PathOrFile, content: bytes) -> None:
 def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> set[str]:
     """Check that a saved model has the needed parts and the right checksums, and return the names of its attributes."""
     file: Any = open_path(source, "r", suffix="zip")
-    start = file.tell()
     try:
         with zipfile.ZipFile(file) as archive:
             parts = archive.namelist()
             damaged = archive.testzip()
-            attributes = set() if damaged or "data" not in parts else set(json.loads(archive.read("data")))
-    except READ_ERRORS as error:
+            if damaged is not None:
+                raise zipfile.BadZipFile(f"the checksum of its part {damaged!r} is wrong")
+            attributes = set(json.loads(archive.read("data"))) if "data" in parts else set()
+    except Exception as error:
+        # Bytes that have changed raise errors of many kinds
         raise ValueError(f"{source} is damaged, or not a saved model: {error}") from error
     finally:
         if isinstance(source, (str, Path)):
             file.close()
-        else:
-            file.seek(start)
-    if damaged is not None:
-        raise ValueError(f"{source} is damaged: the checksum of its part {damaged!r} is wrong")
     missing = [name for name in needed if name not in parts]
     if missing:
         raise ValueError(f"{source} is not a saved model, or not a whole one: it has no {', '.join(missing)}")
