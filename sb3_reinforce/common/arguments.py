@@ -93,12 +93,10 @@ def check_subclass(name: str, value: Any, base: type) -> Any:
 def check_device(name: str, value: Any) -> Any:
     """Return a device that PyTorch knows, or "auto"."""
     check_kind(name, value, (str, th.device))
-    if value != "auto":
-        try:
-            th.device(value)
-        except RuntimeError as error:
-            raise ValueError(f"{name} must be 'auto' or a device that PyTorch knows, got {value!r}: {error}") from error
-    return value
+    try:
+        return value if value == "auto" else th.device(value)
+    except RuntimeError as error:
+        raise ValueError(f"{name} must be 'auto' or a device that PyTorch knows, got {value!r}: {error}") from error
 
 
 class CheckedSchedule(FloatSchedule):

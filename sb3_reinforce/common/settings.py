@@ -180,11 +180,10 @@ def check_finite_difference(model: Any, estimators: Functions, perturbations: Fu
     check_function("perturbation", model.perturbation, perturbations)
     if model.n_delta == 1 and model.estimator == "regression":
         raise ValueError("n_delta must be at least 2 with estimator='regression', which fits an intercept too, got 1")
-    if model.n_top is not None:
-        if model.estimator != "central":
-            raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
-        if model.n_delta is None or model.n_top > model.n_delta:
-            raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
+    if model.n_top is not None and model.estimator != "central":
+        raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
+    if model.n_top is not None and (model.n_delta is None or model.n_top > model.n_delta):
+        raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
 
 
 def check_learn(env: Any, *arguments: Any) -> None:
