@@ -69,11 +69,7 @@ def discounted_return(trajectory, begin=0):
 
 
 def fill(model, batch):
-    """
-    A rollout buffer that holds one episode per environment.
-
-    An environment that has ended its episode has gone on; what it did then has absurd rewards and must not be used.
-    """
+    """A buffer of one episode per environment; what follows an episode has absurd rewards and must not be used."""
     n_steps, n_envs = max(map(len, batch)), len(batch)
     buffer = RolloutBuffer(n_steps, model.observation_space, model.action_space, "cpu", n_envs=n_envs)
     buffer.rewards += 1e6

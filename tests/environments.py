@@ -65,6 +65,8 @@ class Corridor(gym.Env[np.ndarray, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
         self.t, self.length = 0, int(self.np_random.choice(self.lengths))
         return self.observe(), {}
 

@@ -214,7 +214,7 @@ class BasePolicyGradient(BaseAlgorithm):
                 f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing "
                 f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
             )
-        own = {name: states[name] for name in names if name in states}
+        own: dict[str, Any] = {name: states[name] for name in names if name in states}
         for name, state in own.items():
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")

@@ -48,7 +48,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 
 
 def as_reward(reward: Any, env: int) -> float:
-    """The reward of an environment as a float, if it is one number."""
+    """Convert the reward of an environment, which must be one number, to a float."""
     values = np.asarray(reward)
     if values.size != 1 or values.dtype.kind not in "biuf":
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
@@ -61,7 +61,7 @@ def has_form(space: spaces.Space[Any], shape: tuple[int, ...], dtype: np.dtype[A
 
 
 def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
-    """Check the form of one observation, which a VecEnv would broadcast, cut or round to its space without a word."""
+    """Check the form of one observation, which a VecEnv would silently broadcast, cut or round to its space."""
     if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == space.shape and type(space) is spaces.Box:
         return
     if isinstance(space, spaces.Dict):

@@ -1,5 +1,5 @@
 """
-Guards of the environments while a model learns: a fault is named where it comes in, before it does harm.
+Guards of the environments while a model learns: a fault is named where it enters, before it does harm.
 
 ``step_wait`` and ``reset`` are replaced on the instances: of the innermost ``DummyVecEnv``, to check the form of what
 its environments return, and of what lies right below each ``VecNormalize``, to check that numbers are finite before its
@@ -9,7 +9,7 @@ statistics take them in. What a subclass of ``DummyVecEnv`` returns is not check
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -52,7 +52,8 @@ def guard(env: VecEnv | None) -> Iterator[None]:
     with ExitStack() as stack:
         if isinstance(base, SubprocVecEnv):
             watch(base)
-        if type(base) is DummyVecEnv and is_untouched(base):
+        # A user, or an outer learn(), may have replaced a method for stepping on this instance
+        if type(base) is DummyVecEnv and {"step", "step_async", "step_wait", "reset"}.isdisjoint(vars(base)):
             replace(stack, base, "step_wait", partial(stepping.step_wait, base))
             replace(stack, base, "reset", partial(stepping.reset, base))
         while isinstance(env, VecEnvWrapper):
@@ -64,36 +65,15 @@ def guard(env: VecEnv | None) -> Iterator[None]:
         yield
 
 
-def is_untouched(env: DummyVecEnv) -> bool:
-    """Whether neither a user nor an outer ``learn`` has replaced a method for stepping on this instance."""
-    names = ("step", "step_async", "step_wait", "reset")
-    return all(getattr(getattr(env, name), "__func__", None) is getattr(DummyVecEnv, name) for name in names)
-
-
-class Replacement:
-    """Stands for a method of one VecEnv; a copy of the VecEnv has ``before``, the method in whose place this is."""
-
-    def __init__(self, method: Callable[[], Any], before: Callable[[], Any]):
-        self.method = method
-        self.before = before
-
-    def __call__(self) -> Any:
-        return self.method()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A function that returns its second argument
-        return cast, (object, self.before)
-
-
 def replace(stack: ExitStack, env: VecEnv, name: str, method: Callable[[], Any]) -> None:
-    """Put ``method`` in the place of a method of this instance until the stack is left."""
+    """Replace a method of this instance until the stack is left; a copy of the VecEnv stays guarded."""
     own = vars(env)
     before = own.get(name)
-    own[name] = replacement = Replacement(method, getattr(env, name))
+    own[name] = method
 
     def restore() -> None:
         # A user may have replaced it since, for good
-        if own.get(name) is replacement:
+        if own.get(name) is method:
             own.pop(name)
             if before is not None:
                 own[name] = before

@@ -43,6 +43,7 @@ class GymnasiumVecEnv(VecEnv):
             raise TypeError(f"env must be a gymnasium.vector.VectorEnv, got {env!r} of type {type(env).__name__}")
         self.env = env
         self.restart = find_restart(env)
+        self.copies: Any = getattr(env.unwrapped, "envs", None)
         self.actions: Any = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -97,10 +98,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of each copy, or of the vector environment where it has no copies."""
-        copies = getattr(self.env.unwrapped, "envs", None)
-        if copies is not None and attr_name != "render_mode":
-            values = [single.get_wrapper_attr(attr_name) for single in copies]
-        elif hasattr(self.env.unwrapped, "get_attr") and attr_name != "render_mode":
+        if self.copies is not None:
+            values = [single.get_wrapper_attr(attr_name) for single in self.copies]
+        elif hasattr(self.env.unwrapped, "get_attr"):
             values = self.env.unwrapped.get_attr(attr_name)
         else:
             values = [getattr(self.env, attr_name)] * self.num_envs
@@ -119,23 +119,22 @@ class GymnasiumVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
         """Call a method of the copies; a NotImplementedError says where there are none that could be called."""
-        copies = getattr(self.env.unwrapped, "envs", None)
         wanted = list(self._get_indices(indices))
+        if self.copies is not None:
+            calls = [self.copies[i].get_wrapper_attr(method_name) for i in wanted]
+            return [call(*method_args, **kwargs) for call in calls]
         if isinstance(self.env.unwrapped, AsyncVectorEnv) and method_name == "reset":
             return reset_copies(self.env.unwrapped, wanted, **kwargs)
-        if copies is None and wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
+        if wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
             return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
-        if copies is None:
-            raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
-        calls = [copies[i].get_wrapper_attr(method_name) for i in wanted]
-        return [call(*method_args, **kwargs) for call in calls]
+        raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Whether each copy is wrapped in a ``wrapper_class``."""
-        copies = getattr(self.env.unwrapped, "envs", None)
-        return [copies is not None and is_wrapped(copies[i], wrapper_class) for i in self._get_indices(indices)]
+        wanted = self._get_indices(indices)
+        return [self.copies is not None and is_wrapped(self.copies[i], wrapper_class) for i in wanted]
 
     def get_images(self) -> list[np.ndarray | None]:
         """A picture of each copy; None where there is none."""
@@ -162,7 +161,7 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
 
 def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: NDArray[np.bool_]) -> Any:
     """Start new episodes where ``ended`` (n_envs,) by Gymnasium's ``reset_mask``."""
-    # The environment takes the mask out of the options, so that this wrapper would clear the counts of all copies
+    # The environment removes the mask from the options, after which this wrapper would clear the counts of all copies
     counts = []
     wrapper = env
     while isinstance(wrapper, VectorWrapper):

@@ -15,7 +15,7 @@ class Pipe:
     """The learner's end of the pipe to the worker of environment ``env``, which names the worker when it dies."""
 
     # A plain pipe may wait for ever: with start_method="fork" the other workers hold its far end open. Nor does it know
-    # whether an answer is to an earlier question, which Ctrl-C has left unread.
+    # whether an answer belongs to an earlier question, whose answer Ctrl-C has left unread.
 
     def __init__(self, workers: SubprocVecEnv, env: int):
         self.remote: Any = workers.remotes[env]
@@ -35,7 +35,7 @@ class Pipe:
                 self.remote.send(message)
                 self.question = "" if is_last else message[0]
         except Exception as error:
-            # Whoever closes needs no more answers
+            # Closing needs no answer
             if is_last:
                 return
             raise (self.death() if isinstance(error, ConnectionError) else error) from error

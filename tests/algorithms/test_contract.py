@@ -28,7 +28,6 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
@@ -194,11 +193,10 @@ def test_the_log_has_the_keys_of_a2c_and_more(env, tmp_path):
     assert logged_keys(REINFORCE, env, tmp_path / "ours") == logged_keys(A2C, env, tmp_path / "theirs") | more
 
 
-@pytest.mark.parametrize("log_interval", [1, 100, None])
-def test_log_intervals_and_tensorboard(log_interval, tmp_path):
+def test_tensorboard(tmp_path):
     pytest.importorskip("tensorboard")
-    model = make("steps", tensorboard_log=tmp_path).learn(32, log_interval=log_interval)
-    assert model.num_timesteps == 32 and list((tmp_path / "REINFORCE_1").glob("events*"))
+    make("steps", tensorboard_log=tmp_path).learn(32, log_interval=100)
+    assert list((tmp_path / "REINFORCE_1").glob("events*"))
 
 
 @both_modes
@@ -211,7 +209,7 @@ def test_load_with_another_number_of_environments(kind, tmp_path):
 def test_parameters_come_from_a2c():
     """``exact_match=False``, since A2C has no optimizer for the critic alone."""
     other = A2C("MlpPolicy", "CartPole-v1", policy_kwargs={"optimizer_class": th.optim.Adam}).learn(32)
-    model = REINFORCE("MlpPolicy", "CartPole-v1")
+    model = make("steps", policy_kwargs={})
     model.set_parameters(other.get_parameters(), exact_match=False)
     assert all(map(th.equal, model.policy.parameters(), other.policy.parameters()))
     model.learn(64)
@@ -229,9 +227,9 @@ def rate_of(optimizer):
 
 
 def test_an_overshooting_last_rollout_trains_at_no_negative_rate():
-    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=60, learning_rate=lambda progress: progress * 1e-3)
+    model = make("steps", n_steps=60, learning_rate=lambda progress: progress * 1e-3)
     rates = Record(lambda model: rate_of(model.policy.optimizer), at="step")
-    model.learn(100, callback=rates)
+    model.learn(100, callback=rates, log_interval=None)
     assert model.num_timesteps == 120 and rate_of(model.policy.optimizer) == 0 and min(rates.records) >= 0
 
 
@@ -301,26 +299,6 @@ def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(space, 
     model = REINFORCE(policy, Random(space), n_steps=10, learning_rate=0.0, critic_learning_rate=1e-3)
     names = {name for name, _ in model.policy.named_parameters()}
     assert moved_by_learning(model, 20) == {name for name in names if "value_net" in name}
-
-
-class BatchNormExtractor(FlattenExtractor):
-    """An extractor that actor and critic share, with statistics that move when it is evaluated in training mode."""
-
-    def __init__(self, observation_space):
-        super().__init__(observation_space)
-        self.batch_norm = th.nn.BatchNorm1d(self.features_dim)
-
-    def forward(self, observations):
-        return self.batch_norm(super().forward(observations))
-
-
-def test_the_critics_passes_leave_the_statistics_of_a_shared_extractor_alone():
-    statistics = []
-    for n_critic_updates in (1, 20):
-        kwargs = {"features_extractor_class": BatchNormExtractor}
-        model = REINFORCE("MlpPolicy", "CartPole-v1", n_critic_updates=n_critic_updates, seed=0, policy_kwargs=kwargs)
-        statistics.append(model.learn(32).policy.features_extractor.batch_norm.running_mean.clone())
-    assert th.equal(*statistics) and statistics[0].abs().sum() > 0
 
 
 @both_modes

@@ -52,16 +52,16 @@ boxes = st.builds(lambda n, high: spaces.Box(-high, high, (n,)), sizes, st.sampl
 flat = st.one_of(
     boxes,
     st.builds(lambda n, m: spaces.Box(0, 1, (n, m), np.float64), sizes, sizes),
-    st.builds(lambda n: spaces.Discrete(n), sizes),
+    sizes.map(spaces.Discrete),
     st.builds(lambda n: spaces.MultiDiscrete([n, 2]), sizes),
-    st.builds(lambda n: spaces.MultiBinary(n), sizes),
+    sizes.map(spaces.MultiBinary),
 )
 observations = st.one_of(flat, st.dictionaries(st.sampled_from(["a", "b"]), flat, min_size=1).map(spaces.Dict))
 actions = st.one_of(
     boxes,
     st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(2, 4), st.integers(-2, 2)),
     st.builds(lambda n: spaces.MultiDiscrete([n, 2]), st.integers(2, 3)),
-    st.builds(lambda n: spaces.MultiBinary(n), sizes),
+    sizes.map(spaces.MultiBinary),
 )
 floats = st.floats
 
@@ -86,25 +86,19 @@ COMMON = {
     "seed": st.integers(0, 2**31),
 }
 REINFORCE_STRATEGIES = COMMON | {
-    "gamma": floats(0, 1),
-    "ent_coef": floats(0, 1),
-    "vf_coef": floats(0, 1),
+    **dict.fromkeys(("gamma", "ent_coef", "vf_coef"), floats(0, 1)),
+    **dict.fromkeys(("reward_to_go", "discount_scores", "normalize_advantage"), st.booleans()),
     "baseline": st.sampled_from(["none", "mean", "time_mean", "leave_one_out", "value", "optimal"]),
-    "reward_to_go": st.booleans(),
-    "discount_scores": st.booleans(),
     "normalize_by": st.sampled_from(["steps", "episodes"]),
     "n_critic_updates": st.integers(1, 3),
     "batch_size": st.integers(1, 64),
-    "normalize_advantage": st.booleans(),
 }
 FINITE_DIFFERENCE_STRATEGIES = COMMON | {
     "estimator": st.sampled_from(["regression", "central", "forward"]),
     "perturbation": st.sampled_from(["sphere", "gaussian", "rademacher", "coordinate"]),
     "delta_std": st.one_of(st.none(), floats(1e-3, 1), st.just(lambda p: 0.1 + p)),
     "n_eval_episodes": st.integers(1, 2),
-    "common_random_numbers": st.booleans(),
-    "standardize_utilities": st.booleans(),
-    "deterministic": st.booleans(),
+    **dict.fromkeys(("common_random_numbers", "standardize_utilities", "deterministic"), st.booleans()),
 }
 
 

@@ -101,15 +101,14 @@ def formula(
             rewards = [reward for _, _, reward, _, _ in episode]
             _, _, _, terminated, truncated = episode[-1]
             tail = value(len(episode)) if critic and not terminated else 0.0
-            values = [value(t) for t in range(len(episode))] + [tail]
+            values = [value(t) if critic else 0.0 for t in range(len(episode))] + [tail]
             for t, action, *_ in episode:
                 if reward_to_go:
-                    gae = sum(
+                    # Without a critic, V = 0 and λ = 1: the reward-to-go
+                    g = values[t] + sum(
                         (GAMMA * lam) ** (k - t) * (rewards[k] + GAMMA * values[k + 1] - values[k])
                         for k in range(t, len(episode))
                     )
-                    to_go = sum(GAMMA ** (k - t) * rewards[k] for k in range(t, len(episode)))
-                    g = gae + values[t] if critic else to_go
                 else:
                     g = sum(GAMMA**k * reward for k, reward in enumerate(rewards)) + GAMMA ** len(episode) * tail
                 known = critic or terminated or truncated
@@ -250,17 +249,16 @@ def test_a_pass_of_the_critic_descends_its_error(max_grad_norm):
         "MlpPolicy", env, learning_rate=0.0, critic_learning_rate=1.0, n_steps=8, n_critic_updates=1, batch_size=16,
         max_grad_norm=max_grad_norm, policy_kwargs=kwargs, seed=0, device="cpu",
     )  # fmt: skip
-    before = model.policy.value_net.weight.detach().clone()
-    bias = model.policy.value_net.bias.detach().clone()
+    weight, bias = (parameter.detach().clone() for parameter in model.policy.value_net.parameters())
     model.learn(16)
     buffer = model.rollout_buffer
-    weight = before.clone().requires_grad_()
+    weight.requires_grad_()
     values = (th.as_tensor(buffer.observations).flatten(0, 1) @ weight.T + bias).flatten()
     returns = th.as_tensor(buffer.returns).flatten()
     np.testing.assert_allclose(buffer.values.ravel(), values.detach(), rtol=1e-5)
     np.testing.assert_allclose(buffer.advantages.ravel(), returns - values.detach(), rtol=1e-4, atol=1e-3)
     expected = -th.autograd.grad((returns - values).square().mean(), weight)[0]
-    moved = model.policy.value_net.weight.detach() - before
+    moved = (model.policy.value_net.weight - weight).detach()
     if max_grad_norm is None:
         th.testing.assert_close(moved, expected, rtol=1e-4, atol=1e-3)
     else:

@@ -1,7 +1,6 @@
 """While a model learns, a DummyVecEnv returns what its own ``step`` returns, without its deep copies."""
 
 from copy import deepcopy
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,44 +21,40 @@ SPACES = {
 }
 
 
-class Drawn(gym.Env[Any, Any]):
-    """Observations, rewards and ends are drawn; one and the same info is returned at every step."""
+class Drawn(gym.Env):
+    """Draws observations, rewards and ends; if ``reuse``, all infos are one dict and all observations one array."""
 
-    def __init__(self, observation_space: spaces.Space[Any]):
-        self.observation_space, self.action_space = deepcopy(observation_space), spaces.Box(-1, 1, (2,))
-        self.info = {"steps": 0}
+    def __init__(self, space, reuse=False):
+        self.observation_space, self.action_space = deepcopy(SPACES[space]), spaces.Box(-1, 1, (2,))
+        self.reuse, self.info, self.array = reuse, {"steps": 0}, self.observation_space.sample()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def observe(self):
+        obs = self.observation_space.sample()
+        if not self.reuse or not isinstance(obs, np.ndarray):
+            return obs
+        self.array[:] = obs
+        return self.array
+
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
             self.observation_space.seed(seed)
-        return self.observation_space.sample(), {"drawn": float(self.np_random.random())}
+        return self.observe(), {"drawn": float(self.np_random.random())}
 
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.info["steps"] += 1
         terminated, truncated = (self.np_random.random(2) < 0.3).tolist()
-        return self.observation_space.sample(), float(action.sum()), terminated, truncated, self.info
+        info = self.info if self.reuse else dict(self.info)
+        return self.observe(), float(action.sum()), terminated, truncated, info
 
 
-class OneArray(gym.ObservationWrapper[Any, Any, Any]):
-    """Every observation is written into the same array."""
-
-    def __init__(self, env: gym.Env[Any, Any]):
-        super().__init__(env)
-        self.array = env.observation_space.sample()
-
-    def observation(self, observation: np.ndarray) -> np.ndarray:
-        self.array[:] = observation
-        return self.array
-
-
-def make(space: str, wrap: Any = lambda env: env) -> DummyVecEnv:
-    env = DummyVecEnv([lambda: wrap(Drawn(SPACES[space]))] * 3)
+def make(space, **kwargs):
+    env = DummyVecEnv([lambda: Drawn(space, **kwargs)] * 3)
     env.seed(0)
     return env
 
 
-def assert_same(ours: Any, theirs: Any) -> None:
+def assert_same(ours, theirs):
     np.testing.assert_equal(ours, theirs)
     if isinstance(theirs, dict):
         assert all(ours[key].dtype == theirs[key].dtype for key in theirs)
@@ -68,57 +63,38 @@ def assert_same(ours: Any, theirs: Any) -> None:
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_it_returns_what_step_returns(space: str) -> None:
-    ours, theirs = make(space), make(space)
+def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
+    """Also where the environment writes into what it has returned."""
+    ours, theirs, returned = make(space, reuse=True), make(space), []
     with guard(ours):
         assert_same(ours.reset(), theirs.reset())
     for action in np.random.default_rng(0).normal(size=(50, 3, 2)):
         with guard(ours):
-            obs, rewards, dones, infos = ours.step(action)
-        their_obs, their_rewards, their_dones, their_infos = theirs.step(action)
-        for mine, other in ((obs, their_obs), (rewards, their_rewards), (dones, their_dones)):
-            assert_same(mine, other)
-        for done, info, other in zip(dones, infos, their_infos, strict=True):
-            # The one info of Drawn keeps what DummyVecEnv has once written into it
-            wanted = {key: value for key, value in other.items() if done or key != "terminal_observation"}
-            np.testing.assert_equal(info, wanted)
+            returned.append((ours.step(action), theirs.step(action)))
         assert ours.reset_infos == theirs.reset_infos
         # What a callback may look at
         for name in ("actions", "buf_rews", "buf_dones"):
             assert_same(getattr(ours, name), getattr(theirs, name))
-        assert ours.buf_infos == infos
-
-
-def test_what_was_returned_stays_as_it_was() -> None:
-    """Also where the environment writes all its observations into one array."""
-    separate, one = make("box"), make("box", OneArray)
-    separate.reset(), one.reset()
-    returned = []
-    for action in np.random.default_rng(0).normal(size=(50, 3, 2)):
-        with guard(one):
-            returned.append((separate.step(action), one.step(action)))
-    n_ended = 0
-    for (obs, rewards, dones, infos), ours in returned:
-        for mine, other in zip(ours[:3], (obs, rewards, dones), strict=True):
+        assert ours.buf_infos == returned[-1][0][3]
+    for (*arrays, infos), (*their_arrays, their_infos) in returned:
+        for mine, other in zip(arrays, their_arrays, strict=True):
             assert_same(mine, other)
-        for i in np.flatnonzero(dones):
-            assert_same(ours[3][i]["terminal_observation"], infos[i]["terminal_observation"])
-            n_ended += 1
-    assert n_ended > 50
+        np.testing.assert_equal(infos, their_infos)
+    assert sum(dones.sum() for (_, _, dones, _), _ in returned) > 50
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("method", ["step", "step_async", "step_wait", "reset"])
-def test_methods_of_the_users_own_are_called(method: str, kind: str) -> None:
-    """Of a subclass, or put in the place of those of one VecEnv."""
+def test_methods_of_the_users_own_are_called(method, kind):
+    """Whether a subclass overrides them, or the user replaces them on one VecEnv."""
     calls = []
 
-    def own(self: DummyVecEnv, *args: Any) -> Any:
+    def own(self, *args):
         calls.append(method)
         return getattr(DummyVecEnv, method)(self, *args)
 
     subclass = type("Own", (DummyVecEnv,), {method: own})
-    make_model(kind, subclass([lambda: Drawn(SPACES["box"])])).learn(8)
+    make_model(kind, subclass([lambda: Drawn("box")])).learn(8)
     n_calls = len(calls)
     env = make("box")
     setattr(env, method, lambda *args: own(env, *args))

@@ -1,13 +1,12 @@
 """Workers that end in unusual ways: learning ends with an error that names the cause, and nothing hangs."""
 
-import signal
 import threading
 
 import numpy as np
 import pytest
+from callbacks import At
 from environments import Corridor, Faulty
 from models import make
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 # Python warns of fork beside threads; here it is what is tested
@@ -15,39 +14,38 @@ pytestmark = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning"
 KILLED = "was killed by SIGKILL"
 
 
+def faulty(**fault):
+    """Three environments, of which the second has a fault."""
+    truncate = fault.get("truncate", False)
+    return [lambda: Faulty(truncate=truncate), lambda: Faulty(**fault), lambda: Faulty(truncate=truncate)]
+
+
 @pytest.fixture
 def workers():
-    """Makes three environments, of which the second has a fault; the watchdog kills them where a test hangs."""
-    made = []
+    """Starts workers; a watchdog kills them if a test hangs."""
+    started = []
+
+    def start(env_fns, start_method="fork"):
+        started.append(SubprocVecEnv(env_fns, start_method=start_method))
+        return started[-1]
 
     def kill():
-        for env in made:
+        for env in started:
             for process in env.processes:
                 process.kill()
                 process.join()
 
-    def of_three(start_method="fork", env_class=Faulty, **fault):
-        truncate = {"truncate": True} if fault.get("truncate") else {}
-        env_fns = [lambda: env_class(**truncate), lambda: env_class(**fault), lambda: env_class(**truncate)]
-        made.append(SubprocVecEnv(env_fns, start_method=start_method))
-        return made[-1]
-
     watchdog = threading.Timer(120, kill)
     watchdog.start()
-    yield of_three
+    yield start
     watchdog.cancel()
     kill()
 
 
-class Kill(BaseCallback):
-    """Kills a worker between two steps."""
-
-    def _on_step(self):
-        if self.n_calls == 20:
-            process = self.training_env.unwrapped.processes[1]
-            process.kill()
-            process.join()
-        return True
+def kill_worker(model):
+    process = model.get_env().unwrapped.processes[1]
+    process.kill()
+    process.join()
 
 
 @pytest.mark.parametrize("kind", ["episodes", "search"])
@@ -65,10 +63,10 @@ class Kill(BaseCallback):
 )
 def test_a_worker_that_dies_is_named(start_method, fault, end, kind, workers, tmp_path):
     """Also with fork, where the other workers hold its pipe open and a plain step would wait for ever."""
-    env = workers(start_method, fault=fault, at=2)
+    env = workers(faulty(fault=fault, at=2), start_method)
     model = make(kind, env, **({"common_random_numbers": True} if kind == "search" else {}))
     with pytest.raises(ConnectionError, match=f"worker of environment 1 died: it {end}"):
-        model.learn(10_000, callback=Kill() if fault == "between two steps" else None)
+        model.learn(10_000, callback=At(20, kill_worker) if fault == "between two steps" else None)
     env.close()
     assert all(not process.is_alive() for process in env.processes)
     model.save(tmp_path / "model")
@@ -76,9 +74,9 @@ def test_a_worker_that_dies_is_named(start_method, fault, end, kind, workers, tm
     assert model.learn(32).num_timesteps >= 32
 
 
-def test_the_only_worker_dies():
-    """Nobody else holds its end of the pipe open then."""
-    env = SubprocVecEnv([lambda: Faulty("die in step", at=2)], start_method="fork")
+def test_the_only_worker_dies(workers):
+    """No other worker holds its end of the pipe open then."""
+    env = workers([lambda: Faulty("die in step", at=2)])
     with pytest.raises(ConnectionError, match=f"worker of environment 0 died: it {KILLED}"):
         make("steps", env).learn(24)
     env.close()
@@ -87,7 +85,7 @@ def test_the_only_worker_dies():
 
 def test_a_worker_that_died_between_two_runs(workers):
     """The plain VecEnv would wait for ever in its reset, and in a call of a callback."""
-    env = workers()
+    env = workers(faulty())
     model = make("steps", env).learn(24)
     env.processes[1].kill()
     for call in (lambda: model.learn(24), env.reset, lambda: env.get_attr("n_steps")):
@@ -95,23 +93,9 @@ def test_a_worker_that_died_between_two_runs(workers):
             call()
 
 
-class Together(Faulty):
-    """Every copy has the fault."""
-
-    def __init__(self, **fault):
-        super().__init__("raise in step", at=3)
-
-
-class Short(Faulty):
-    """Every observation is too short."""
-
-    def observe(self):
-        return super().observe()[:2]
-
-
-@pytest.mark.parametrize("env_class", [Together, Short])
-def test_environments_that_fail_together_can_be_closed(env_class, workers):
-    env = workers(env_class=env_class)
+@pytest.mark.parametrize("fault", [("raise in step", 3), ("first observation", 1, np.zeros(2))], ids=str)
+def test_environments_that_fail_together_can_be_closed(fault, workers):
+    env = workers([lambda: Faulty(*fault)] * 3)
     with pytest.raises((ConnectionError, ValueError), match=r"environment 0 (died|must have shape \(7,\))"):
         make("steps", env).learn(100)
     env.close()
@@ -126,7 +110,7 @@ class TwoArguments(Exception):
 
 
 def test_an_answer_that_cannot_be_unpickled_is_not_waited_for_again(workers):
-    env = workers(fault="observation", at=3, value=TwoArguments("one", "two"))
+    env = workers(faulty(fault="observation", at=3, value=TwoArguments("one", "two")))
     with pytest.raises(TypeError, match="missing 1 required positional argument"):
         make("steps", env).learn(100)
     env.close()
@@ -136,43 +120,31 @@ def test_an_answer_that_cannot_be_unpickled_is_not_waited_for_again(workers):
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 @pytest.mark.parametrize("value", [np.zeros(8, np.float32), "x", np.ones(7) * 1j], ids=["long", "string", "complex"])
 @pytest.mark.parametrize(
-    ("fault", "step"),
+    ("fault", "step", "what"),
     [
-        (dict(fault="observation", at=5), 4),
-        (dict(fault="observation", at=7, truncate=True), 6),
-        (dict(fault="first observation", at=2), 6),
+        (dict(fault="observation", at=5), 4, "observation of environment 1 must"),
+        (dict(fault="observation", at=7, truncate=True), 6, "observation of environment 1 must"),
+        (dict(fault="first observation", at=2), 6, "observation of environment 1 must"),
+        (dict(fault="reward", at=5), 4, "reward of environment 1 must be a number"),
     ],
 )
-def test_malformed_observations_are_named(fault, step, value, wrapper, workers):
-    model = make("steps", wrapper(workers(value=value, **fault)))
-    with pytest.raises(ValueError, match=rf"observation of environment 1 must .*\(step {step} since"):
+def test_malformed_observations_and_rewards_are_named(fault, step, what, value, wrapper, workers):
+    model = make("steps", wrapper(workers(faulty(value=value, **fault))))
+    with pytest.raises(ValueError, match=rf"{what}.*\(step {step} since"):
         model.learn(400)
 
 
-@pytest.mark.parametrize("value", ["x", np.ones(2), 1j], ids=repr)
-def test_rewards_that_are_no_numbers_are_named(value, workers):
-    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
-        make("steps", workers(fault="reward", at=5, value=value)).learn(400)
-
-
-class ArrayRewards(Corridor):
-    """Rewards are arrays of one number."""
-
-    def __init__(self):
-        super().__init__((7,), reward=lambda t, action: np.ones(1))
-
-
 def test_rewards_that_are_arrays_of_one_number(workers):
-    env = VecNormalize(workers(env_class=ArrayRewards))
+    env = VecNormalize(workers([lambda: Corridor((7,), reward=lambda t, action: np.ones(1))] * 3))
     make("steps", env).learn(100)
     assert env.ret_rms.mean.shape == () and env.returns.shape == (3,)
 
 
 @pytest.mark.parametrize("kind", ["steps", "search"])
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
-def test_a_step_that_is_broken_off(number, kind, workers):
-    """The answers that nobody has waited for are not taken for those to what is asked next."""
-    env = workers(fault=number, at=20)
+def test_an_interrupted_step(number, kind, workers):
+    """Its unread answers are not taken for those to the next question."""
+    env = workers(faulty(fault=number, at=20))
     model = make(kind, env)
     with pytest.raises(KeyboardInterrupt):
         model.learn(400)
@@ -182,8 +154,8 @@ def test_a_step_that_is_broken_off(number, kind, workers):
     assert made == [(model.num_timesteps - n_steps) // 3] * 3
 
 
-def test_workers_are_closed_after_a_step_that_is_broken_off(workers):
-    env = workers(fault=signal.SIGTERM.name, at=5)
+def test_workers_are_closed_after_an_interrupted_step(workers):
+    env = workers(faulty(fault="SIGTERM", at=5))
     with pytest.raises(KeyboardInterrupt):
         make("steps", env).learn(400)
     env.close()

@@ -87,12 +87,7 @@ def test_returns_and_timesteps_of_a_grid_drawn_by_hand():
     rewards = np.array([[1, 1], [2, 10], [4, 100], [8, 1000], [16, 10000]], dtype=float)
     dones = np.array([[0, 0], [1, 0], [0, 0], [1, 1], [0, 0]], dtype=bool)
     assert timesteps_of(dones, np.array([1, 0])).tolist() == [[1, 0], [2, 1], [0, 2], [1, 3], [0, 0]]
-    assert reward_to_go(rewards, dones, 1.0).tolist() == [[3, 1111], [2, 1110], [12, 1100], [8, 1000], [16, 10000]]
-
-
-def test_reward_to_go_and_total_return_of_the_chapters_episode():
-    """Chapter 11: rewards [1, 3, 2] without discount; every step has total return 6, and 6, 5, 2 to go."""
-    rewards, dones = np.array([[1.0], [3.0], [2.0]]), np.array([[False], [False], [True]])
-    to_go = reward_to_go(rewards, dones, gamma=1.0)
-    assert to_go.ravel().tolist() == [6, 5, 2]
-    assert total_return(to_go, np.array([[0], [1], [2]]), 1.0, np.zeros(1)).ravel().tolist() == [6, 6, 6]
+    to_go = reward_to_go(rewards, dones, 1.0)
+    assert to_go.tolist() == [[3, 1111], [2, 1110], [12, 1100], [8, 1000], [16, 10000]]
+    total = total_return(to_go, timesteps_of(dones, np.array([1, 0])), 1.0, np.array([32, 0]))
+    assert total.tolist() == [[35, 1111], [35, 1111], [12, 1111], [12, 1111], [16, 10000]]

@@ -1,20 +1,23 @@
 """Where V comes from, and that a features extractor is evaluated no more often than it must be."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
-from environments import Corridor
+from environments import Corridor, Random
+from gymnasium import spaces
+from models import moved_by_learning
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.critic import fit_critic, values_along
 from sb3_reinforce.policies.evaluation import evaluate, route_of
 from sb3_reinforce.policies.plain_mlp import plain_critic
 
 N_STEPS, N_ENVS = 7, 3
+IMAGES = partial(Random, spaces.Box(0, 255, (36, 36, 3), np.uint8), lengths=(10,))
 MODES = [{"baseline": "value", "n_steps": 10}, {"baseline": "none", "n_steps": None, "n_episodes": N_ENVS}]
 
 
@@ -32,8 +35,7 @@ both_policies = pytest.mark.parametrize("policy", [ActorCriticPolicy, ActorCriti
 
 
 def make(policy=ActorCriticPolicy, **kwargs):
-    is_image = issubclass(policy, ActorCriticCnnPolicy)
-    env = make_vec_env(lambda: FakeImageEnv(screen_height=36, screen_width=36) if is_image else Corridor(), N_ENVS, 0)
+    env = make_vec_env(lambda: IMAGES() if issubclass(policy, ActorCriticCnnPolicy) else Corridor(), N_ENVS, 0)
     return REINFORCE(policy, env, **{"n_steps": N_STEPS, "seed": 0, "device": "cpu", **kwargs})
 
 
@@ -41,45 +43,16 @@ def observations(buffer):
     return th.as_tensor(buffer.observations).flatten(0, 1)
 
 
-@pytest.mark.parametrize(
-    ("policy", "kwargs"),
-    [
-        (ActorCriticPolicy, {}),
-        (ActorCriticPolicy, {"activation_fn": th.nn.ReLU}),
-        (ActorCriticCnnPolicy, {}),
-        (overriding(ActorCriticCnnPolicy), {}),
-    ],
-)
-def test_values_are_the_policys(policy, kwargs):
-    """From plain layers, along with the actions, or in one batch."""
-    model = make(policy, learning_rate=0.0, policy_kwargs=kwargs).learn(1)
-    with th.no_grad():
-        expected = model.policy.predict_values(observations(model.rollout_buffer)).reshape(N_STEPS, N_ENVS)
-    values = values_along(model.policy, route_of(model.policy, True), model.rollout_buffer)
-    np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-6)
-    assert np.std(values) > 1e-3
-
-
 @pytest.mark.parametrize("share", [True, False])
 @both_policies
-def test_a_kept_features_extractor_gives_the_same_critic(policy, share):
-    """As many passes over the same data, from kept features and from the observations."""
-    kwargs = {"policy_kwargs": {"share_features_extractor": share}}
-    short, long = make(policy, **kwargs), make(overriding(policy), **kwargs)
-    obs, returns = observations(short.learn(1).rollout_buffer), th.randn(N_STEPS * N_ENVS)
-    long.policy.load_state_dict(short.policy.state_dict())
-    fitted = []
-    for model in (short, long):
-        names = ["value_net", "mlp_extractor.value_net", *([] if share else ["vf_features_extractor"])]
-        critic = [parameter for name in names for parameter in model.policy.get_submodule(name).parameters()]
-        th.manual_seed(1)
-        fit_critic(
-            model.policy, route_of(model.policy, True), th.optim.SGD(critic, 1e-3), critic, obs, returns, 3, 5, None
-        )
-        fitted.append(critic)
-    for mine, other in zip(*fitted, strict=True):
-        th.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
-    assert not th.equal(fitted[0][0], make(policy, **kwargs).policy.value_net.weight)
+def test_cached_features_give_the_same_critic(policy, share):
+    """As many passes over the same data, from cached features and from the observations."""
+    kwargs, ends = {"share_features_extractor": share, "optimizer_class": th.optim.SGD}, []
+    for cls in (policy, overriding(policy)):
+        model = make(cls, learning_rate=1e-3, n_critic_updates=3, batch_size=5, policy_kwargs=kwargs)
+        assert "value_net.weight" in moved_by_learning(model, 1)
+        ends.append(dict(model.policy.named_parameters()))
+    th.testing.assert_close(*ends, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
@@ -89,7 +62,7 @@ def test_how_often_a_shared_features_extractor_is_evaluated(mode):
     calls = []
     model.policy.features_extractor.register_forward_hook(lambda *args: calls.append(1))
     model.learn(1)
-    n_steps = 10  # the length of every episode, which a time limit ends
+    n_steps = 10  # the length of every episode
     assert len(calls) == n_steps + 1 + (1 + 2 if mode["baseline"] == "value" else 0)
 
 
@@ -116,21 +89,32 @@ def tie(policy):
 CHANGES = {
     "none": lambda policy: None,
     "method": lambda policy: setattr(policy, "predict_values", lambda obs: th.full((len(obs), 1), 3.0)),
-    "class": lambda policy: setattr(policy, "__class__", overriding(ActorCriticPolicy)),
+    "class": lambda policy: setattr(policy, "__class__", overriding(type(policy))),
     "hook": lambda policy: policy.mlp_extractor.value_net.register_forward_hook(lambda module, x, output: output + 1),
     "no bias": lambda policy: setattr(policy.value_net, "bias", None),
     "tied": tie,
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_critic_that_the_user_has_changed_is_evaluated_as_it_is(change):
-    policy, buffer = make().policy, make().learn(1).rollout_buffer
-    CHANGES[change](policy)
+@pytest.mark.parametrize(
+    ("policy", "kwargs", "change"),
+    [
+        *((ActorCriticPolicy, {}, change) for change in CHANGES),
+        (ActorCriticPolicy, {"activation_fn": th.nn.ReLU}, "none"),
+        (ActorCriticCnnPolicy, {}, "none"),
+        (ActorCriticCnnPolicy, {}, "class"),
+    ],
+)
+def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs, change):
+    """From plain layers, along with the actions, or in one batch."""
+    model = make(policy, learning_rate=0.0, policy_kwargs=kwargs)
+    CHANGES[change](model.policy)
+    buffer = model.learn(1).rollout_buffer
     with th.no_grad():
-        expected = policy.predict_values(observations(buffer)).reshape(N_STEPS, N_ENVS)
-    np.testing.assert_allclose(values_along(policy, route_of(policy, True), buffer), expected, rtol=1e-5, atol=1e-6)
-    assert (plain_critic(policy) is not None) == (change in ("none", "tied"))
+        expected = model.policy.predict_values(observations(buffer)).reshape(N_STEPS, N_ENVS)
+    np.testing.assert_allclose(buffer.values, expected, rtol=1e-4, atol=1e-6)
+    assert change == "method" or np.std(buffer.values) > 1e-3
+    assert (plain_critic(model.policy) is not None) == (change in ("none", "tied") and policy is ActorCriticPolicy)
 
 
 def test_a_hook_on_a_parameter_of_the_critic_is_called():

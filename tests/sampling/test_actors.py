@@ -1,5 +1,7 @@
 """The NumPy actor is the policy: the same function of the observation, the same actions for the same seed."""
 
+from functools import partial
+from itertools import product
 from operator import attrgetter
 
 import numpy as np
@@ -76,9 +78,13 @@ def test_a_run_does_not_depend_on_the_path(space):
     th.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
 
 
-def override_in_class(thing, *names):
-    """Give the methods of a subclass −20 times their argument, which turns the preferences around."""
-    cls = type(thing)
+def part(policy, path):
+    return attrgetter(path)(policy) if path else policy
+
+
+def override_in_class(policy, path, names):
+    """Give methods of a subclass −20 times their argument, which turns the preferences around."""
+    thing, cls = part(policy, path), type(part(policy, path))
     methods = {
         name: lambda self, action_logits, *args, name=name: getattr(cls, name)(self, action_logits * -20, *args)
         for name in names
@@ -86,48 +92,38 @@ def override_in_class(thing, *names):
     thing.__class__ = type(f"Own{cls.__name__}", (cls,), methods)
 
 
-def override_in_instance(thing, *names):
-    """As in a class, but for this one object."""
+def override_in_instance(policy, path, names):
     for name in names:
-        method = getattr(thing, name)
-        setattr(thing, name, lambda action_logits, *args, method=method: method(action_logits * -20, *args))
+        method = getattr(part(policy, path), name)
+        replacement = lambda action_logits, *args, method=method: method(action_logits * -20, *args)  # noqa: E731
+        setattr(part(policy, path), name, replacement)
 
 
-def hook(module):
-    """Turn the preferences of a module around."""
-    module.register_forward_hook(lambda module, inputs, output: output * -20)
+def hook(policy, path):
+    part(policy, path).register_forward_hook(lambda module, inputs, output: output * -20)
 
 
-METHODS = {
-    "": ("extract_features", "get_distribution evaluate_actions", "_get_action_dist_from_latent"),
-    "features_extractor": ("forward",),
-    "mlp_extractor": ("forward_actor",),
-    "mlp_extractor.policy_net": ("forward",),
-    "action_net": ("forward",),
-    "action_dist": ("proba_distribution",),
-}
-HOOKED = (
-    *("action_net", "mlp_extractor.policy_net", "mlp_extractor.policy_net.0"),
-    *("features_extractor", "features_extractor.flatten"),
-)
-
-
-def part(policy, path):
-    return attrgetter(path)(policy) if path else policy
-
-
+METHODS = [
+    ("", ["extract_features"]),
+    ("", ["get_distribution", "evaluate_actions"]),
+    ("", ["_get_action_dist_from_latent"]),
+    ("features_extractor", ["forward"]),
+    ("mlp_extractor", ["forward_actor"]),
+    ("mlp_extractor.policy_net", ["forward"]),
+    ("action_net", ["forward"]),
+    ("action_dist", ["proba_distribution"]),
+]
+BODY, EXTRACTOR = "mlp_extractor.policy_net", "features_extractor"
 CHANGES = {
-    f"{override.__name__}: {path} {names}": lambda policy, override=override, path=path, names=names: override(
-        part(policy, path), *names.split()
-    )
+    f"{override.__name__} {path} {names}": partial(override, path=path, names=names)
     for override in (override_in_class, override_in_instance)
-    for path, methods in METHODS.items()
-    for names in methods
+    for path, names in METHODS
 }
-CHANGES |= {f"hook on {path}": lambda policy, path=path: hook(part(policy, path)) for path in HOOKED}
 CHANGES |= {
-    "pre-hook": lambda policy: policy.action_net.register_forward_pre_hook(lambda module, x: (x[0] * -20,)),
+    f"hook on {path}": partial(hook, path=path)
+    for path in ("action_net", BODY, f"{BODY}.0", EXTRACTOR, f"{EXTRACTOR}.flatten")
 }
+CHANGES["pre-hook"] = lambda policy: policy.action_net.register_forward_pre_hook(lambda module, x: (x[0] * -20,))
 # These do not turn the preferences around
 SLIGHT = {
     "none": lambda policy: None,
@@ -165,6 +161,8 @@ def test_a_policy_that_is_not_plain_acts_by_its_own_methods():
         REINFORCE("MlpPolicy", images, device="cpu").policy,
     ]
     assert type(policies[-1].features_extractor) is FlattenExtractor
+    policies.append(make_policy(spaces.Box(-1, 1, (2,))))
+    policies[-1].action_dist = SquashedDiagGaussianDistribution(2)
     assert not any(isinstance(actor_of(policy, 2), NumpyActor) for policy in policies)
     assert plain_actor(th.compile(make_policy(), backend="eager")) is None
 
@@ -172,73 +170,57 @@ def test_a_policy_that_is_not_plain_acts_by_its_own_methods():
 @pytest.mark.parametrize(
     ("register", "module", "least"),
     [
-        ("register_full_backward_hook", "mlp_extractor.policy_net.2", 1),
-        ("register_full_backward_hook", "action_net", 1),
-        ("register_full_backward_pre_hook", "mlp_extractor.policy_net.2", 1),
-        ("register_full_backward_pre_hook", "action_net", 1),
-        ("register_forward_hook", "", 8),
-        ("register_forward_hook", "mlp_extractor", 8),
-        ("register_forward_hook", "features_extractor.flatten", 8),
+        *product(("full_backward_hook", "full_backward_pre_hook"), (f"{BODY}.2", "action_net"), (1,)),
+        *product(("forward_hook",), ("", "mlp_extractor", f"{EXTRACTOR}.flatten"), (8,)),
     ],
 )
 def test_hooks_are_called_as_in_a2c(register, module, least):
     """Users log gradients with them."""
     model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
-    getattr(model.policy.get_submodule(module), register)(lambda *args: calls.append(1))
+    getattr(model.policy.get_submodule(module), f"register_{register}")(lambda *args: calls.append(1))
     model.learn(8)
     assert len(calls) >= least
-
-
-def test_a_squashed_gaussian_is_squashed():
-    policy = make_policy(spaces.Box(-1, 1, (2,)))
-    policy.action_dist = SquashedDiagGaussianDistribution(2)
-    actions = actor_of(policy, 3).act(10 * np.ones((3, 5), dtype=np.float32))[0]
-    assert np.abs(actions).max() < 1
 
 
 OFFSET = th.tensor([-100.0, 100.0])
 
 
-def prefer(policy):
+def prefer(model):
     with th.no_grad():
-        policy.action_net.bias.copy_(OFFSET)
+        model.policy.action_net.bias.copy_(OFFSET)
 
 
 def new_policy(model):
     model.policy = type(model.policy)(model.observation_space, model.action_space, model.lr_schedule)
-    prefer(model.policy)
+    prefer(model)
 
 
 def new_layer(model):
     model.policy.action_net = th.nn.Linear(64, 2)
-    prefer(model.policy)
-
-
-def new_memory(model):
-    model.policy.action_net.bias.data = OFFSET.clone()
-
-
-def new_parameter(model):
-    model.policy.action_net.bias = th.nn.Parameter(OFFSET.clone())
-
-
-def new_hook(model):
-    model.policy.action_net.register_forward_hook(lambda module, inputs, logits: logits + OFFSET)
+    prefer(model)
 
 
 def new_method(model):
-    layer = model.policy.action_net
-    layer.forward = lambda x: type(layer).forward(layer, x) + OFFSET
+    forward = model.policy.action_net.forward
+    model.policy.action_net.forward = lambda x: forward(x) + OFFSET
 
 
-HOWS = [lambda model: prefer(model.policy), new_policy, new_layer, new_memory, new_parameter, new_hook, new_method]
+HOWS = {
+    "values": prefer,
+    "policy": new_policy,
+    "layer": new_layer,
+    "method": new_method,
+    "memory": lambda model: setattr(model.policy.action_net.bias, "data", OFFSET.clone()),
+    "parameter": lambda model: setattr(model.policy.action_net, "bias", th.nn.Parameter(OFFSET.clone())),
+    "hook": lambda model: model.policy.action_net.register_forward_hook(lambda module, x, logits: logits + OFFSET),
+}
 
 
-@pytest.mark.parametrize("how", HOWS, ids=lambda how: how.__name__)
+@pytest.mark.parametrize("how", HOWS)
 def test_a_policy_that_a_callback_changes_acts_differently_at_once(how):
     """As with A2C, not only from the next rollout on."""
     model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=40, learning_rate=0.0, seed=0, device="cpu")
-    model.learn(40, callback=At(10, how))
+    model.learn(40, callback=At(10, HOWS[how]))
     actions = model.rollout_buffer.actions.ravel()
     assert 0 in actions[:10] and (actions[10:] == 1).all()
     log_probs = model.rollout_buffer.log_probs.ravel()

@@ -1,6 +1,5 @@
-"""The comparison script: what its rows say is what happened, and a run is made once."""
+"""The comparison script: its rows are true, and no run is repeated."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -8,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 from unittest import mock
 
 import pytest
@@ -21,24 +19,25 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy
 
 from sb3_reinforce.zoo import HYPERPARAMS, experiments
 
-BENCHMARKS = Path(__file__).parents[2] / "examples" / "benchmarks"
 # The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+BENCHMARKS = Path(__file__).parents[2] / "examples" / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+import compare
 
 
-compare = load("compare")
+@pytest.fixture
+def plots(monkeypatch):
+    pytest.importorskip("rliable")
+    import compare_plots
+
+    monkeypatch.setattr(compare_plots, "REPETITIONS", 20)
+    return compare_plots
 
 
 @pytest.mark.parametrize("algorithm", compare.ALGORITHMS)
-def test_rows_of_a_run(algorithm: str) -> None:
+def test_rows_of_a_run(algorithm):
     run = compare.Run("CartPole-v1", algorithm, 0, 600)
     model, env, eval_env = compare.make(run)
     evaluations = compare.Evaluations(run, env, eval_env)
@@ -62,7 +61,7 @@ def test_rows_of_a_run(algorithm: str) -> None:
     assert rows["return"].between(1, 500).all() and rows["episodes"].iloc[-1] == 20
 
 
-def test_runs_share_no_policy_kwargs() -> None:
+def test_runs_share_no_policy_kwargs():
     first, second = (
         compare.make(compare.Run("MountainCarContinuous-v0", algorithm, 0, 600))[0] for algorithm in ("a2c", "ppo")
     )
@@ -70,7 +69,7 @@ def test_runs_share_no_policy_kwargs() -> None:
     assert "optimizer_class" not in second.policy_kwargs
 
 
-def test_peers_use_the_settings_of_another_version_and_searches_may_have_none() -> None:
+def test_peers_use_the_settings_of_another_version_and_searches_may_have_none():
     assert compare.settings_of("ppo", "Hopper-v5")["gamma"] == 0.999
     assert compare.settings_of("ars", "Hopper-v5")["alive_bonus_offset"] == -1
     assert compare.settings_of("finite_difference", "FrozenLake-v1") is None
@@ -78,7 +77,7 @@ def test_peers_use_the_settings_of_another_version_and_searches_may_have_none() 
     assert model.learn(64).num_timesteps >= 64
 
 
-def test_settings_of_an_atari_game() -> None:
+def test_settings_of_an_atari_game():
     pytest.importorskip("ale_py")
     assert [bool(compare.settings_of(name, "ALE/Pong-v5")) for name in compare.ALGORITHMS] == [1, 0, 1, 1, 0]
     run = compare.Run("ALE/Pong-v5", "reinforce", 0, 600)
@@ -92,7 +91,7 @@ def test_settings_of_an_atari_game() -> None:
     assert evaluations.steps() == env.num_envs < sum(env.get_attr("total_steps")) / 4
 
 
-def test_models_have_the_settings_that_train_would_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_have_the_settings_that_train_would_read(tmp_path, monkeypatch):
     default = {"policy": "MlpPolicy", "n_timesteps": 64, "temperature": "lin_1", "ent_coef": "lin_0.1"}
     (tmp_path / "reinforce.yml").write_text(json.dumps({"default": default}))
     monkeypatch.setattr(experiments, "HYPERPARAMS", tmp_path)
@@ -101,9 +100,7 @@ def test_models_have_the_settings_that_train_would_read(tmp_path: Path, monkeypa
     assert compare.make(compare.Run("Pendulum-v1", "reinforce", 0, 600))[0].temperature == 1.0
 
 
-def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(tmp_path, plots, monkeypatch, capsys):
     output = tmp_path / "made" / "results.csv"
     command = [sys.executable, str(BENCHMARKS / "compare.py"), "--tasks", "CartPole-v1", "--timesteps", "200"]
     command += ["--algorithms", "reinforce", "a2c", "--seeds", "0", "1", "--final-episodes", "10", "--processes", "1"]
@@ -116,17 +113,14 @@ def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(
     assert list(zip(final["algorithm"], final["seed"], strict=True)) == runs
     with mock.patch.object(signal, "signal"), pytest.raises(SystemExit, match="Nothing to do"):
         compare.main()
-    pytest.importorskip("rliable")
     monkeypatch.setattr(sys, "argv", ["compare_plots.py", str(output), "--output", str(tmp_path / "picture")])
-    plots = load("compare_plots")
-    monkeypatch.setattr(plots, "REPETITIONS", 20)
     plots.main()
     assert {path.name for path in tmp_path.glob("*.png")} == {"picture_curves.png", "picture_summary.png"}
     median = final[final["algorithm"] == "reinforce"]["return"].median()
     assert f"| CartPole-v1 (200) | REINFORCE | 2 | {median:.1f} (" in capsys.readouterr().out
 
 
-def test_sigterm_ends_the_processes_too(tmp_path: Path) -> None:
+def test_sigterm_ends_the_processes_too(tmp_path):
     output = tmp_path / "results.csv"
     arguments = ["--tasks", "CartPole-v1", "--algorithms", "reinforce", "--timesteps", "10000000", "--processes", "1"]
     arguments += ["--output", str(output)]
@@ -145,7 +139,7 @@ def test_sigterm_ends_the_processes_too(tmp_path: Path) -> None:
         os.killpg(script.pid, signal.SIGKILL)
 
 
-def test_a_task_that_is_not_registered_is_named_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_that_is_not_registered_is_named_at_once(tmp_path, capsys):
     with mock.patch.object(sys, "argv", ["compare.py", "--tasks", "Nope-v5", "--output", str(tmp_path / "r.csv")]):
         with pytest.raises(SystemExit):
             compare.main()
@@ -160,13 +154,7 @@ def test_a_task_that_is_not_registered_is_named_at_once(tmp_path: Path, capsys: 
         ([("a2c", "Reacher-v5")], "A2C (seed 0), A2C (seed 1)", {"reinforce", "ppo"}),
     ],
 )
-def test_a_summary_says_what_it_leaves_out(
-    missing: list[tuple[str, str]], sentence: str, drawn: set[str], capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    pytest.importorskip("rliable")
-    plots = load("compare_plots")
-    monkeypatch.setattr(plots, "REPETITIONS", 20)
+def test_a_summary_says_what_it_leaves_out(missing, sentence, drawn, plots, capsys):
     rows = [
         {"task": task, "budget": 9, "algorithm": name, "seed": seed, "evaluation": "final", "return": -5.0 * seed}
         for name in ("reinforce", "a2c", "ppo")
@@ -181,7 +169,6 @@ def test_a_summary_says_what_it_leaves_out(
     plots.plt.close("all")
 
 
-def test_every_task_with_settings_has_a_reference() -> None:
-    pytest.importorskip("rliable")
+def test_every_task_with_settings_has_a_reference(plots):
     published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
-    assert load("compare_plots").REFERENCES.keys() >= published.keys() - {"default", "atari"}
+    assert plots.REFERENCES.keys() >= published.keys() - {"default", "atari"}

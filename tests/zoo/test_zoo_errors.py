@@ -2,8 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -16,88 +15,62 @@ from huggingface_hub.errors import HTTPError
 from rl_zoo3.exp_manager import ExperimentManager
 from zoo_commands import message_of, train
 
-from sb3_reinforce.zoo import __main__
-
 # The Zoo and its dependencies emit warnings of their own
 pytestmark = pytest.mark.filterwarnings("ignore")
 REINFORCE = ["train", "--algo", "reinforce"]
 
 
-def raising(error: Exception) -> Callable[..., None]:
-    def function(*arguments: object, **kwargs: object) -> None:
-        raise error
-
-    return function
+ENTRY = "policy: MlpPolicy, n_timesteps: 100"
+CONFIGURATIONS = [
+    ("[1, 2]", "must map environments to settings, got a list"),
+    ("", "must map environments to settings, got a NoneType"),
+    ("CartPole-v1: {", "cannot be read: "),
+    ("Acrobot-v1: {policy: MlpPolicy}", "must have an entry CartPole-v1 or default"),
+    ("CartPole-v1:", "The entry CartPole-v1 of"),
+    ("CartPole-v1: 5", "must hold settings, such as policy: 'MlpPolicy', got 5"),
+    ("CartPole-v1: {policy: MlpPolicy}", "must hold n_timesteps"),
+    ("CartPole-v1: {n_timesteps: 100}", "must hold policy"),
+]
+SETTINGS = [
+    ("policy: 5", "policy must be a name, or the path of a class, got 5"),
+    ("policy: Mlp", "policy must be a class or one of 'MlpPolicy'"),
+    ("policy: CnnPolicy", "You should use NatureCNN only with images"),
+    ("n_timesteps: 1e6", "write !!float 1e6"),
+    ("n_timesteps: 0", "n_timesteps must be finite and >= 1, got 0"),
+    ("n_envs: 0", "n_envs must be at least 1, got 0"),
+    ("learning_rate: 1e-3", "write !!float 1e-3"),
+    ("learning_rate: cos_1e-3", "lin_NUMBER"),
+    ("ent_coef: lin_x", "lin_NUMBER"),
+    ("learning_rate: null", "Invalid value for learning_rate: None"),
+    ("n_step: 5", "did you mean n_steps"),
+    ("seed: 5", "'seed' is not a setting"),
+    ("gamma: 3", "gamma must be in [0, 1], got 3"),
+    ("gamma: x", "gamma must be a number, got 'x' of type str"),
+    ("policy_kwargs: 'dict('", "must be Python, but 'dict(' raises SyntaxError"),
+    ("policy_kwargs: [1]", "policy_kwargs must be a dict"),
+    ("policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
+    ("policy: LinearPolicy, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
+    ("normalize: nn.Norm", "but 'nn.Norm' raises AttributeError"),
+    ("env_kwargs: 3", "env_kwargs must be a dict, got 3"),
+    ("env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
+    ("frame_stack: a", "frame_stack must be an integer, got 'a'"),
+]
 
 
 @pytest.mark.parametrize(
     ("conf", "sentence"),
-    [
-        ("[1, 2]", "must map environments to settings, got a list"),
-        ("", "must map environments to settings, got a NoneType"),
-        ("CartPole-v1: {", "cannot be read: "),
-        ("Acrobot-v1: {policy: MlpPolicy}", "must have an entry CartPole-v1 or default"),
-        ("CartPole-v1:", "The entry CartPole-v1 of"),
-        ("CartPole-v1: 5", "must hold settings, such as policy: 'MlpPolicy', got 5"),
-    ],
+    [*CONFIGURATIONS, *((f"CartPole-v1: {{{ENTRY}, {entry}}}", sentence) for entry, sentence in SETTINGS)],
 )
-def test_a_configuration_without_settings_is_named(
-    conf: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_configuration_is_named(conf, sentence, tmp_path, capsys):
     (tmp_path / "wrong.yml").write_text(conf)
-    arguments = ["train", "--algo", "reinforce", "-conf", str(tmp_path / "wrong.yml"), "-f", str(tmp_path)]
-    assert sentence in message_of(capsys, *arguments)
-
-
-@pytest.mark.parametrize(
-    ("entry", "sentence"),
-    [
-        ("policy: MlpPolicy", "must hold n_timesteps"),
-        ("n_timesteps: 100", "must hold policy"),
-        ("policy: 5, n_timesteps: 100", "policy must be a name, or the path of a class, got 5"),
-        ("policy: Mlp, n_timesteps: 100", "policy must be a class or one of 'MlpPolicy'"),
-        ("policy: MlpPolicy, n_timesteps: 1e6", "write !!float 1e6"),
-        ("policy: MlpPolicy, n_timesteps: 0", "n_timesteps must be finite and >= 1, got 0"),
-        ("policy: MlpPolicy, n_timesteps: 100, n_envs: 0", "n_envs must be at least 1, got 0"),
-        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: 1e-3", "write !!float 1e-3"),
-        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: cos_1e-3", "lin_NUMBER"),
-        ("policy: MlpPolicy, n_timesteps: 100, ent_coef: lin_x", "lin_NUMBER"),
-        ("policy: MlpPolicy, n_timesteps: 100, learning_rate: null", "Invalid value for learning_rate: None"),
-        ("policy: MlpPolicy, n_timesteps: 100, n_step: 5", "did you mean n_steps"),
-        ("policy: MlpPolicy, n_timesteps: 100, seed: 5", "'seed' is not a setting"),
-        ("policy: MlpPolicy, n_timesteps: 100, gamma: 3", "gamma must be in [0, 1], got 3"),
-        ("policy: MlpPolicy, n_timesteps: 100, gamma: x", "gamma must be a number, got 'x' of type str"),
-        (
-            "policy: MlpPolicy, n_timesteps: 100, policy_kwargs: 'dict('",
-            "must be Python, but 'dict(' raises SyntaxError",
-        ),
-        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: [1]", "policy_kwargs must be a dict"),
-        (
-            "policy: MlpPolicy, n_timesteps: 100, normalize: nn.Norm",
-            "but 'nn.Norm' raises AttributeError",
-        ),
-        ("policy: MlpPolicy, n_timesteps: 100, policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
-        ("policy: LinearPolicy, n_timesteps: 100, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
-        ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: 3", "env_kwargs must be a dict, got 3"),
-        ("policy: MlpPolicy, n_timesteps: 100, env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
-        ("policy: MlpPolicy, n_timesteps: 100, frame_stack: a", "frame_stack must be an integer, got 'a'"),
-        ("policy: CnnPolicy, n_timesteps: 100", "You should use NatureCNN only with images"),
-    ],
-)
-def test_a_wrong_setting_is_named(
-    entry: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "wrong.yml").write_text(f"CartPole-v1: {{{entry}}}")
-    name = "finite_difference" if "LinearPolicy" in entry else "reinforce"
+    name = "finite_difference" if "LinearPolicy" in conf else "reinforce"
     arguments = ["train", "--algo", name, "-conf", str(tmp_path / "wrong.yml"), "-f", str(tmp_path)]
     assert sentence in message_of(capsys, *arguments)
 
 
 @pytest.mark.parametrize("error", [ValueError("another"), TypeError("f() got an unexpected keyword argument 'x'")])
-def test_an_error_that_is_not_of_the_configuration_stays_one(
-    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ExperimentManager, "create_envs", raising(error))
+def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, monkeypatch):
+    monkeypatch.setattr(ExperimentManager, "create_envs", mock.Mock(side_effect=error))
     with pytest.raises(type(error)) as caught:
         train("reinforce", "-f", str(tmp_path))
     assert caught.value is error
@@ -130,41 +103,31 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(
         (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
     ],
 )
-def test_a_wrong_command_is_answered_with_a_sentence(
-    arguments: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_a_wrong_command_is_answered_with_a_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert sentence in message_of(capsys, *arguments)
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])
-def test_a_benchmark_without_network_says_to_pass_no_hub(
-    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", raising(error))
+def test_a_benchmark_without_network_says_to_pass_no_hub(error, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", mock.Mock(side_effect=error))
     assert "does not answer (no network): pass --no-hub" in message_of(capsys, "benchmark", "--log-dir", str(tmp_path))
 
 
-def test_plots_of_runs_that_cannot_be_compared_say_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    module = importlib.import_module(__main__.FUNCTIONS["plot_from_file"])
-    monkeypatch.setattr(module, "plot_from_file", raising(ValueError("min() arg is an empty sequence")))
+def test_plots_of_runs_that_cannot_be_compared_say_what_to_do(monkeypatch, capsys):
+    module = importlib.import_module("rl_zoo3.plots.plot_from_file")
+    fail = mock.Mock(side_effect=ValueError("min() arg is an empty sequence"))
+    monkeypatch.setattr(module, "plot_from_file", fail)
     assert "all_plots keeps only such runs, and with --max-timesteps" in message_of(capsys, "plot_from_file", "-i", "x")
 
 
-def test_a_missing_tensorboard_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_tensorboard_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stable_baselines3.common.utils, "SummaryWriter", None)
     arguments = ("train", "--algo", "reinforce", "-f", str(tmp_path), "-n", "100", "-tb", str(tmp_path / "tb"))
     assert "tensorboard is not installed" in message_of(capsys, *arguments)
 
 
-def test_a_package_of_the_extra_that_is_missing_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_package_of_the_extra_that_is_missing_is_named(monkeypatch, capsys):
     for module in [module for module in sys.modules if module.startswith("rl_zoo3.plots")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "seaborn", None)

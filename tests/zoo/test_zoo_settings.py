@@ -1,7 +1,6 @@
 """Which settings an algorithm gets in the Zoo: published, of a model, of a trial; and what they are turned into."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -33,11 +32,11 @@ OTHER = {
 }
 
 
-def load(run: Path) -> Any:
+def load(run):
     return ALGORITHMS[run.parent.name].load(run / f"{run.name.rpartition('_')[0]}.zip", device="cpu")
 
 
-def conf(folder: Path, **entries: Any) -> tuple[str, ...]:
+def conf(folder, **entries):
     """Arguments that name a configuration with these entries, whose runs go to the same folder."""
     (folder / "conf.yml").write_text(yaml.safe_dump(entries))
     return "-conf", str(folder / "conf.yml"), "-f", str(folder), "--eval-freq", "-1"
@@ -46,30 +45,25 @@ def conf(folder: Path, **entries: Any) -> tuple[str, ...]:
 @pytest.mark.parametrize(
     ("env", "left_out"), [("CartPole-v1", set()), ("Pendulum-v1", {"temperature"}), ("FrozenLake-v1", {"normalize"})]
 )
-def test_a_default_is_fitted_to_the_spaces(env: str, left_out: set[str], tmp_path: Path) -> None:
+def test_a_default_is_fitted_to_the_spaces(env, left_out, tmp_path):
     default = {"policy": "MlpPolicy", "n_timesteps": 32, "temperature": "lin_1", "normalize": True}
     train("reinforce", *conf(tmp_path, default=default), env=env)
     assert default.keys() - config_of(tmp_path / "reinforce" / f"{env}_1").keys() == left_out
 
 
-class Dicts(gym.ObservationWrapper[Any, Any, Any]):
-    """Observations in a dict, with one that cannot be normalized."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.observation_space = spaces.Dict({"obs": env.observation_space, "one": spaces.Discrete(2)})
-
-    def observation(self, observation: Any) -> dict[str, Any]:
-        return {"obs": observation, "one": 1}
+def make_dicts():
+    """CartPole with observations in a dict, of which one cannot be normalized."""
+    env = gym.make("CartPole-v1")
+    space = spaces.Dict({"obs": env.observation_space, "one": spaces.Discrete(2)})
+    return gym.wrappers.TransformObservation(env, lambda obs: {"obs": obs, "one": 1}, space)
 
 
 @pytest.mark.parametrize(("env", "changed"), [("FrozenLake-v1", {}), ("Dicts-v0", {"policy": "MultiInputPolicy"})])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_published_default_trains_on_observations_that_cannot_be_normalized(
-    name: str, env: str, changed: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    spec = gym.envs.registration.EnvSpec("Dicts-v0", lambda: Dicts(gym.make("CartPole-v1")), max_episode_steps=20)
+def test_the_published_default_fits_observations_that_cannot_be_normalized(
+    name, env, changed, tmp_path, monkeypatch, capsys
+):
+    spec = gym.envs.registration.EnvSpec("Dicts-v0", make_dicts, max_episode_steps=20)
     monkeypatch.setitem(gym.registry, "Dicts-v0", spec)
     common = ("-f", str(tmp_path), "-n", "100")
     train(name, *common, "--eval-freq", "-1", env=env)
@@ -81,7 +75,7 @@ def test_the_published_default_trains_on_observations_that_cannot_be_normalized(
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_argument_that_may_be_a_schedule_may_fall(name: str, tmp_path: Path) -> None:
+def test_every_argument_that_may_be_a_schedule_may_fall(name, tmp_path):
     entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1")
     entry = {"policy": "MlpPolicy", "n_timesteps": 64, **({"n_delta": 2} if "delta_std" in entry else {}), **entry}
     train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
@@ -93,7 +87,7 @@ def test_every_argument_that_may_be_a_schedule_may_fall(name: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_model_goes_on_with_its_own_settings(name: str, tmp_path: Path) -> None:
+def test_a_model_goes_on_with_its_own_settings(name, tmp_path):
     params = [f"{key}:{value!r}" for key, value in OTHER[name].items()]
     common = ("-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), "-params")
     train(name, *common, *params, "policy:'MlpPolicy'", "policy_kwargs:dict(net_arch=[5])")
@@ -109,7 +103,7 @@ def test_a_model_goes_on_with_its_own_settings(name: str, tmp_path: Path) -> Non
     assert config_of(tmp_path / name / "CartPole-v1_2") == config_of(tmp_path / name / RUN) | {"learning_rate": 0.0}
 
 
-def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path: Path) -> None:
+def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path):
     arguments = conf(tmp_path, **{"CartPole-v1": {"policy": "MlpPolicy", "n_timesteps": 64, "gamma": 0.5}})
     train("reinforce", "-n", "64", "--eval-freq", "-1", "-f", str(tmp_path))
     train("reinforce", "-i", str(tmp_path / "reinforce" / RUN / "CartPole-v1.zip"), *arguments)
@@ -117,9 +111,7 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_optuna_tunes_and_its_trials_can_be_trained(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_optuna_tunes_and_its_trials_can_be_trained(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
     train(name, "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--no-optim-plots", *study)
@@ -136,7 +128,7 @@ def test_optuna_tunes_and_its_trials_can_be_trained(
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name: str) -> None:
+def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
     for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
@@ -152,7 +144,7 @@ ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPA
 
 
 @pytest.mark.parametrize(("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default")])
-def test_every_entry_trains(name: str, env: str, tmp_path: Path) -> None:
+def test_every_entry_trains(name, env, tmp_path):
     try:
         rl_zoo3.utils.gym.make(env).close()
     except DependencyNotInstalled as error:
