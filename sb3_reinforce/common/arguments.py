@@ -1,7 +1,6 @@
 """Checks of what a user passes in: each error names the argument, its value and what is allowed."""
 
 import difflib
-import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -10,19 +9,26 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 # (name, value) -> value, or an error that names the argument
 Check: TypeAlias = Callable[[str, Any], Any]
 
-# A larger step can take a parameter out of the range of float32
-MAX_LEARNING_RATE = 1e6
+# A bound that leaves out infinity
+MAX = sys.float_info.max
 
 
-def wrong_type(name: str, allowed: str, value: Any) -> TypeError:
-    """Make the error for a value of the wrong type."""
-    return TypeError(f"{name} must be {allowed}, got {value!r} of type {type(value).__name__}")
+def check_kind(name: str, value: Any, kinds: tuple[Any, ...], allowed: str = "") -> Any:
+    """Return an instance of one of some types; the error says in words what is ``allowed``, or names the types."""
+    # To Python True is a number
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        allowed = allowed or " or ".join(each.__name__ for each in kinds)
+        raise TypeError(f"{name} must be {allowed}, got {value!r} of type {type(value).__name__}")
+    return value
+
+
+# A name or the user's own function
+check_name = partial(check_kind, kinds=(str, Callable), allowed="a name or a callable")
 
 
 def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> ValueError:
@@ -33,33 +39,22 @@ def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> V
     return ValueError(f"{name} must be {allowed} {', '.join(map(repr, known.values()))}, got {value!r}{hint}")
 
 
-def check_number(
-    name: str,
-    value: Any,
-    low: float = -math.inf,
-    high: float = math.inf,
-    above: bool = False,
-    finite: bool = True,
-) -> float:
+def check_number(name: str, value: Any, low: float = -MAX, high: float = MAX, above: bool = False) -> float:
     """Return a number in the range as a float; with ``above``, ``low`` itself is excluded."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
-        raise wrong_type(name, "a number", value)
-    number = float(value)
-    if (finite and math.isinf(number)) or not low <= number <= high or (above and number == low):
+    number = float(check_kind(name, value, (Real,), "a number"))
+    if not low <= number <= high or (above and number == low):
         allowed = "finite"
-        if high < math.inf:
+        if high < MAX:
             allowed = f"in {'(' if above else '['}{low:g}, {high:g}]"
-        elif low > -math.inf:
-            allowed = f"{'finite and ' if finite else ''}{'>' if above else '>='} {low:g}"
+        elif low > -MAX:
+            allowed = f"{'finite and ' if high == MAX else ''}{'>' if above else '>='} {low:g}"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 
 
 def check_integer(name: str, value: Any, low: int, high: int = sys.maxsize) -> int:
     """Return an integer in the range as Python's own, since not all libraries take NumPy's."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral):
-        raise wrong_type(name, "an integer", value)
-    number = int(value)
+    number = int(check_kind(name, value, (Integral,), "an integer"))
     if not low <= number <= high:
         allowed = f"at least {low}"
         if high < sys.maxsize or number > high:
@@ -70,9 +65,7 @@ def check_integer(name: str, value: Any, low: int, high: int = sys.maxsize) -> i
 
 def check_flag(name: str, value: Any) -> bool:
     """Return True or False."""
-    if not isinstance(value, (bool, np.bool_)):
-        raise wrong_type(name, "True or False", value)
-    return bool(value)
+    return bool(check_kind(name, value, (bool, np.bool_), "True or False"))
 
 
 def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
@@ -90,20 +83,6 @@ def check_function(name: str, value: Any, functions: Mapping[str, Callable[..., 
     return function
 
 
-def check_name(name: str, value: Any) -> Any:
-    """Return a name or a callable."""
-    if not (isinstance(value, str) or callable(value)):
-        raise wrong_type(name, "a name or a callable", value)
-    return value
-
-
-def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> Any:
-    """Return an instance of one of some types."""
-    if not isinstance(value, kinds):
-        raise wrong_type(name, " or ".join(each.__name__ for each in kinds), value)
-    return value
-
-
 def check_subclass(name: str, value: Any, base: type) -> Any:
     """Return a subclass of ``base``."""
     if not (isinstance(value, type) and issubclass(value, base)):
@@ -114,22 +93,17 @@ def check_subclass(name: str, value: Any, base: type) -> Any:
 def check_device(name: str, value: Any) -> Any:
     """Return a device that PyTorch knows, or "auto"."""
     check_kind(name, value, (str, th.device))
-    if value != "auto":
-        try:
-            th.device(value)
-        except RuntimeError as error:
-            raise ValueError(f"{name} must be 'auto' or a device that PyTorch knows, got {value!r}: {error}") from error
-    return value
+    try:
+        return value if value == "auto" else th.device(value)
+    except RuntimeError as error:
+        raise ValueError(f"{name} must be 'auto' or a device that PyTorch knows, got {value!r}: {error}") from error
 
 
 class CheckedSchedule(FloatSchedule):
     """A number, or a function of the remaining progress (from 1 to 0), whose every value is checked."""
 
-    def __init__(
-        self, name: str, schedule: float | Schedule, low: float = 0.0, above: bool = False, high: float = math.inf
-    ):
-        if not (callable(schedule) or isinstance(schedule, Real)):
-            raise wrong_type(name, "a number or a schedule", schedule)
+    def __init__(self, name: str, schedule: Any, low: float, high: float = MAX, above: bool = False):
+        check_kind(name, schedule, (Real, Callable), "a number or a schedule")
         super().__init__(schedule if callable(schedule) else check_number(name, schedule, low, high, above))
         self.given = schedule
         self.check = partial(check_number, low=low, high=high)
@@ -144,31 +118,6 @@ class CheckedSchedule(FloatSchedule):
         # At the end of training nothing is drawn any more, so that a schedule may fall to an excluded bound
         above = self.above and progress_remaining > 0
         return self.check(f"{self.name} (at progress {progress_remaining:g})", value, above=above)
-
-
-def number(low: float = -math.inf, high: float = math.inf, above: bool = False, finite: bool = True) -> Check:
-    """Make a check for a number."""
-    return partial(check_number, low=low, high=high, above=above, finite=finite)
-
-
-def integer(low: int, high: int = sys.maxsize) -> Check:
-    """Make a check for an integer."""
-    return partial(check_integer, low=low, high=high)
-
-
-def choice(*names: str) -> Check:
-    """Make a check for one of some names."""
-    return partial(check_choice, choices=names)
-
-
-def kind(*kinds: type) -> Check:
-    """Make a check for an instance of some types."""
-    return partial(check_kind, kinds=kinds)
-
-
-def schedule(low: float = 0.0, high: float = math.inf, above: bool = False) -> Check:
-    """Make a check for a number or a schedule, which returns a ``CheckedSchedule``."""
-    return partial(CheckedSchedule, low=low, high=high, above=above)
 
 
 def optional(check: Check) -> Check:

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from inspect import signature
+from io import BytesIO
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
 from sb3_reinforce.common.states import check_finite, generator_states, optimizer_mismatch, restore_generators
-from sb3_reinforce.common.storage import PathOrFile, atomic_write, check_archive
+from sb3_reinforce.common.storage import PathOrFile, check_archive, write_whole
 
 __all__ = ["BasePolicyGradient", "uninterrupted"]
 
@@ -57,9 +58,8 @@ class BasePolicyGradient(BaseAlgorithm):
         check_policy_name(policy, self.policy_aliases)
         if needs_env or env is not None:
             env = check_env(env, verbose)
-        if policy_kwargs is not None:
-            # Stable-Baselines3 writes to it
-            kwargs["policy_kwargs"] = dict(policy_kwargs)
+        # A copy: Stable-Baselines3 writes to it
+        kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)
 
@@ -119,8 +119,9 @@ class BasePolicyGradient(BaseAlgorithm):
         :raises OSError: If the file cannot be written
         """
         self._random_state = generator_states(self.device)
-        with atomic_write(path) as file:
-            super().save(file, exclude, include)
+        buffer = BytesIO()
+        super().save(buffer, exclude, include)
+        write_whole(path, buffer.getvalue())
 
     @classmethod
     def load(
@@ -221,23 +222,24 @@ class BasePolicyGradient(BaseAlgorithm):
         check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
         try:
-            if "policy" in own:
-                self.policy.load_state_dict(own["policy"], strict=exact_match)
-            super().set_parameters(self._fitting(own, exact_match), exact_match, device)
+            # The policy comes first, and with it a mismatch that is named by its parameters
+            for name, state in own.items():
+                self._set_state(name, state, exact_match)
         except BaseException:
-            super().set_parameters(before, device=device)
+            super().set_parameters(before)
             raise
 
-    def _fitting(self, states: dict[str, Any], exact_match: bool) -> dict[str, Any]:
-        """The states without optimizers of another kind, which are an error with ``exact_match``."""
-        fitting = dict(states)
-        for name, state in states.items():
-            part = recursive_getattr(self, name)
-            reason = optimizer_mismatch(part, state) if isinstance(part, th.optim.Optimizer) else ""
-            if reason:
-                needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
-                if exact_match:
-                    raise ValueError(f"{needed}, but {reason}")
-                del fitting[name]
-                warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
-        return fitting
+    def _set_state(self, name: str, state: Any, exact_match: bool) -> None:
+        """Load one state; another kind of optimizer's is left out, or with ``exact_match`` an error."""
+        part = recursive_getattr(self, name)
+        if isinstance(part, th.nn.Module):
+            part.load_state_dict(state, strict=exact_match)
+            return
+        reason = optimizer_mismatch(part, state)
+        needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
+        if reason and exact_match:
+            raise ValueError(f"{needed}, but {reason}")
+        if reason:
+            warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
+        else:
+            part.load_state_dict(state)

@@ -16,23 +16,21 @@ class Uninterrupted(ContextDecorator, threading.local):
     depth = 0
 
     def __init__(self) -> None:
-        self.pending: list[Callable[[], Any]] = []
+        # An exit stack calls all of its functions, even if one raises
+        self.pending = ExitStack()
 
     def __enter__(self) -> None:
         self.depth += 1
 
     def __exit__(self, *error: object) -> None:
         self.depth -= 1
-        if self.pending and not self.depth:
-            with ExitStack() as stack:
-                # An exit stack calls all of them, last in first out, even if one raises
-                while self.pending:
-                    stack.callback(self.pending.pop())
+        if not self.depth:
+            self.pending.close()
 
     def handle_signal(self, handler: Callable[..., Any], number: int, frame: FrameType | None) -> None:
         """Call a handler now or at the end of the block."""
         if self.depth:
-            self.pending.append(partial(handler, number, frame))
+            self.pending.callback(handler, number, frame)
         else:
             handler(number, frame)
 

@@ -1,5 +1,6 @@
 """The arguments of both algorithms: one table of checks for each, and what arguments must satisfy together."""
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -11,39 +12,33 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
 
 from sb3_reinforce.common.arguments import (
-    MAX_LEARNING_RATE,
     Check,
     CheckedSchedule,
+    check_choice,
     check_device,
     check_flag,
     check_function,
+    check_integer,
+    check_kind,
     check_name,
+    check_number,
     check_subclass,
-    choice,
-    integer,
-    kind,
-    number,
     optional,
-    schedule,
     unknown_name,
-    wrong_type,
 )
 
 Functions = Mapping[str, Callable[..., Any]]
 
+# A larger step can take a parameter out of the range of float32
+MAX_LEARNING_RATE = 1e6
 # What NumPy takes
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
 STACK_FRAMES = "stack observations with VecFrameStack, or use RecurrentPPO of sb3-contrib"
 MASK_LOGITS = "mask the logits in a subclass of ActorCriticPolicy, or use MaskablePPO of sb3-contrib"
-CONTRIB_POLICIES = {
-    "MlpLstmPolicy": STACK_FRAMES,
-    "CnnLstmPolicy": STACK_FRAMES,
-    "MultiInputLstmPolicy": STACK_FRAMES,
-    "RecurrentActorCriticPolicy": STACK_FRAMES,
-    "MaskableActorCriticPolicy": MASK_LOGITS,
-}
+RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
+CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK_LOGITS}
 ONE_STEP = "it takes one policy step per rollout, which max_grad_norm alone bounds"
 OPTIMIZER = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead
@@ -55,15 +50,6 @@ INSTEAD_OF_PPO = {
     "use_rms_prop": OPTIMIZER,
     "rms_prop_eps": OPTIMIZER,
 }
-DEFAULT_N_STEPS = 32
-DEFAULT_N_EPISODES = 16
-
-
-def check_policy(name: str, value: Any) -> Any:
-    """Return a policy's name or class."""
-    if not isinstance(value, (str, type)):
-        raise wrong_type(name, "a name or a class", value)
-    return value
 
 
 def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
@@ -71,9 +57,8 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
     if policy in known or policy in known.values():
         return
     names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
-    for name, remedy in CONTRIB_POLICIES.items():
-        if name in names:
-            raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {remedy}")
+    for name in names & CONTRIB_POLICIES.keys():
+        raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 
@@ -87,57 +72,58 @@ def check_callback(name: str, value: Any) -> Any:
     return value
 
 
+check_count = partial(check_integer, low=1)
 COMMON_ARGUMENTS: dict[str, Check] = {
-    "policy": check_policy,
-    "learning_rate": schedule(high=MAX_LEARNING_RATE),
+    "policy": partial(check_kind, kinds=(str, type), allowed="a name or a class"),
+    "learning_rate": partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE),
     # SB3 users also write inf for no clipping
-    "max_grad_norm": optional(number(0, above=True, finite=False)),
-    "max_episode_steps": integer(1),
-    "stats_window_size": integer(1),
-    "tensorboard_log": optional(kind(str, os.PathLike)),
-    "policy_kwargs": optional(kind(Mapping)),
-    "verbose": integer(0),
-    "seed": optional(integer(0, MAX_SEED)),
+    "max_grad_norm": optional(partial(check_number, low=0, high=math.inf, above=True)),
+    "max_episode_steps": check_count,
+    "stats_window_size": check_count,
+    "tensorboard_log": optional(partial(check_kind, kinds=(str, os.PathLike))),
+    "policy_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
+    "verbose": partial(check_integer, low=0),
+    "seed": optional(partial(check_integer, low=0, high=MAX_SEED)),
     "device": check_device,
 }
 REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
-    "n_steps": optional(integer(1)),
-    "gamma": number(0, 1),
-    "gae_lambda": number(0, 1),
-    "ent_coef": schedule(),
-    "vf_coef": number(0),
+    "n_steps": optional(check_count),
+    "gamma": partial(check_number, low=0, high=1),
+    "gae_lambda": partial(check_number, low=0, high=1),
+    "ent_coef": partial(CheckedSchedule, low=0),
+    "vf_coef": partial(check_number, low=0),
     "baseline": check_name,
-    "n_episodes": optional(integer(1)),
+    "n_episodes": optional(check_count),
     "reward_to_go": check_flag,
     "discount_scores": check_flag,
-    "normalize_by": choice("steps", "episodes"),
-    "n_critic_updates": integer(1),
-    "batch_size": integer(1),
-    "critic_learning_rate": optional(schedule(high=MAX_LEARNING_RATE)),
-    "temperature": schedule(above=True, high=MAX_TEMPERATURE),
-    "min_std": number(0),
+    "normalize_by": partial(check_choice, choices=("steps", "episodes")),
+    "n_critic_updates": check_count,
+    "batch_size": check_count,
+    "critic_learning_rate": optional(partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE)),
+    "temperature": partial(CheckedSchedule, low=0, above=True, high=MAX_TEMPERATURE),
+    "min_std": partial(check_number, low=0),
     "use_sde": check_flag,
-    "sde_sample_freq": integer(-1),
+    "sde_sample_freq": partial(check_integer, low=-1),
     "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
-    "rollout_buffer_kwargs": optional(kind(Mapping)),
+    "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
     "normalize_advantage": check_flag,
 }
 FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "estimator": check_name,
     "perturbation": check_name,
-    "n_delta": optional(integer(1)),
-    "delta_std": optional(schedule(above=True)),
-    "n_eval_episodes": integer(1),
+    "n_delta": optional(check_count),
+    "delta_std": optional(partial(CheckedSchedule, low=0, above=True)),
+    "n_eval_episodes": check_count,
     "common_random_numbers": check_flag,
-    "n_top": optional(integer(1)),
+    "n_top": optional(check_count),
     "standardize_utilities": check_flag,
     "deterministic": check_flag,
 }
 LEARN_ARGUMENTS: dict[str, Check] = {
-    "total_timesteps": number(0),
+    "total_timesteps": partial(check_number, low=0),
     "callback": check_callback,
-    "log_interval": optional(integer(1)),
-    "tb_log_name": kind(str),
+    "log_interval": optional(check_count),
+    "tb_log_name": partial(check_kind, kinds=(str,)),
     "reset_num_timesteps": check_flag,
     "progress_bar": check_flag,
 }
@@ -162,8 +148,8 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     check_attributes(model, REINFORCE_ARGUMENTS)
     check_function("baseline", model.baseline, baselines)
     if model.n_steps is None and model.n_episodes is None:
-        model.n_steps = DEFAULT_N_STEPS if model.has_critic else None
-        model.n_episodes = None if model.has_critic else DEFAULT_N_EPISODES
+        model.n_steps = 32 if model.has_critic else None
+        model.n_episodes = None if model.has_critic else 16
     if model.n_steps is not None and model.n_episodes is not None:
         raise ValueError(
             f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r} are both given: a rollout is either a "
@@ -194,11 +180,10 @@ def check_finite_difference(model: Any, estimators: Functions, perturbations: Fu
     check_function("perturbation", model.perturbation, perturbations)
     if model.n_delta == 1 and model.estimator == "regression":
         raise ValueError("n_delta must be at least 2 with estimator='regression', which fits an intercept too, got 1")
-    if model.n_top is not None:
-        if model.estimator != "central":
-            raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
-        if model.n_delta is None or model.n_top > model.n_delta:
-            raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
+    if model.n_top is not None and model.estimator != "central":
+        raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
+    if model.n_top is not None and (model.n_delta is None or model.n_top > model.n_delta):
+        raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
 
 
 def check_learn(env: Any, *arguments: Any) -> None:

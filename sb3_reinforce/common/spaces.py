@@ -82,10 +82,3 @@ def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
     """Turn stored actions ``(n, action_dim)`` into what ``evaluate_actions`` takes: int64 ``(n,)`` for Discrete."""
     return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions.float()
-
-
-def zeros(space: spaces.Space[Any]) -> Any:
-    """Make a batch of one element of a space, all zeros: an array, or a dict of arrays."""
-    if isinstance(space, spaces.Dict):
-        return {key: zeros(part) for key, part in space.spaces.items()}
-    return np.zeros((1, *(space.shape or ())), dtype=space.dtype)

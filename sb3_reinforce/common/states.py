@@ -2,28 +2,23 @@
 
 import pickle
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch as th
 
 
-def check_finite(states: Mapping[str, Any], infinite: set[str]) -> None:
-    """Check the numbers of nested states; those with a name in ``infinite`` may be infinite, but not NaN."""
-    for name, number in named_numbers("", states):
+def check_finite(state: Any, infinite: set[str], name: str = "") -> None:
+    """Check the numbers of a nested state; those with a name in ``infinite`` may be infinite, but not NaN."""
+    if isinstance(state, (th.Tensor, float)):
+        number = th.as_tensor(state)
         if th.isnan(number).any() or (name not in infinite and th.isinf(number).any()):
             raise ValueError(f"load_path_or_dict must have finite numbers, got {number} for {name[1:]}")
-
-
-def named_numbers(name: str, state: Any) -> Iterator[tuple[str, th.Tensor]]:
-    """Yield the tensors and floats of a nested state, each with its path."""
-    if isinstance(state, (th.Tensor, float)):
-        yield name, th.as_tensor(state)
     elif isinstance(state, (Mapping, list, tuple)):
         parts = state.items() if isinstance(state, Mapping) else enumerate(state)
         for key, part in parts:
-            yield from named_numbers(f"{name}.{key}", part)
+            check_finite(part, infinite, f"{name}.{key}")
 
 
 def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) -> str:

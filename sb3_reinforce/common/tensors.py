@@ -18,10 +18,10 @@ def flatten(tensors: TensorOrDict) -> TensorOrDict:
 
 
 def take(tensors: TensorOrDict, index: th.Tensor | slice) -> TensorOrDict:
-    """``tensors[index]``, for each tensor of a dict."""
-    if isinstance(tensors, th.Tensor):
-        return tensors[index]
-    return {key: part[index] for key, part in tensors.items()}
+    """``tensors[index]``, for each tensor of a dict; for arrays too."""
+    if isinstance(tensors, dict):
+        return {key: part[index] for key, part in tensors.items()}
+    return tensors[index]
 
 
 def select(tensors: TensorOrDict, mask: th.Tensor) -> TensorOrDict:

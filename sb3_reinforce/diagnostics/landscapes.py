@@ -58,12 +58,9 @@ class CandidateUtility:
         seeds = np.broadcast_to(self.seed + np.arange(self.n_episodes), (len(candidates), self.n_episodes))
         self.seed += self.n_episodes
         limit = getattr(self.model, "max_episode_steps", 100_000)
-        normalize = self.model.get_vec_normalize_env()
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)
-            returns = evaluate_candidates(
-                self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count, normalize
-            )
+            returns = evaluate_candidates(self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
     def _count(self, step: CandidateStep) -> None:

@@ -1,22 +1,25 @@
 """θ, the parameters of a policy's actor, as one vector of float64, which holds every float32 exactly."""
 
 from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
 import torch as th
+from gymnasium.vector.utils import create_empty_array
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.common.spaces import as_policy_actions, zeros
+from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     """The trainable parameters that log π depends on, in the policy's order, without ``log_std``."""
-    obs = obs_as_tensor(zeros(policy.observation_space), policy.device)
-    action_dim = int(np.prod(zeros(policy.action_space).shape))
-    actions = as_policy_actions(th.zeros(1, action_dim, device=policy.device), policy.action_space)
+    zero_obs: Any = create_empty_array(policy.observation_space)
+    obs = obs_as_tensor(zero_obs, policy.device)
+    zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
+    actions = as_policy_actions(zeros, policy.action_space)
     log_std = getattr(policy, "log_std", None)
     trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
     training = policy.training

@@ -73,15 +73,9 @@ class NumpyActor:
         self.outputs: list[Floats] = []
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
+        mlp = policy.mlp_extractor
         extractor = policy.pi_features_extractor
-        parts = [
-            policy,
-            policy.mlp_extractor,
-            policy.mlp_extractor.policy_net,
-            extractor,
-            *extractor.children(),
-            *layers,
-        ]
+        parts = [policy, mlp, mlp.policy_net, extractor, *extractor.children(), *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
         self.dicts = [vars(policy.action_dist), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
@@ -157,10 +151,9 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
     epsilon = noise.numpy()
     log_sigma = log_std.detach().numpy()
 
-    def sample(means: Floats) -> Floats:
+    def sample(means: Floats) -> Any:
         noise.normal_()
-        actions: Floats = means + np.exp(log_sigma) * epsilon
-        return actions
+        return means + np.exp(log_sigma) * epsilon
 
     return sample
 
@@ -170,11 +163,10 @@ def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.nd
     noise = th.empty(n_envs, n_actions)
     scores = noise.numpy()
 
-    def sample(logits: Floats) -> np.ndarray:
+    def sample(logits: Floats) -> Any:
         noise.exponential_()
         np.log(scores, scores)
         np.subtract(logits, scores, scores)
-        actions: np.ndarray = scores.argmax(1)
-        return actions
+        return scores.argmax(1)
 
     return sample

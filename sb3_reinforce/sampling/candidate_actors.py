@@ -4,37 +4,24 @@ Several parameter vectors acting side by side: vector i in environment i.
 Plain actors act together, by batched matrix products; any other policy acts in one environment after the other.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
-from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.evaluation import distribution_of
 from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, temperature_hooks
 
 
-class CandidateActor(ABC):
-    """Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters."""
-
-    @abstractmethod
-    def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
-        """From now on, act with candidates of shape ``(m, n)`` in ``m`` environments."""
-
-    @abstractmethod
-    def act(self, obs: Any) -> np.ndarray:
-        """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
-
-
-class LoopActor(CandidateActor):
+class LoopActor:
     """
     The policy's own ``predict``, in one environment after the other, for any policy.
 
@@ -52,23 +39,25 @@ class LoopActor(CandidateActor):
         self.thetas = to_vector(searched).repeat(n_envs, 1)
 
     def assign(self, envs: Sequence[int], thetas: th.Tensor) -> None:
+        """From now on, act with candidates of shape ``(m, n)`` in ``m`` environments."""
         self.thetas[envs] = thetas.to(self.thetas)
 
     @uninterrupted
     def act(self, obs: Any) -> np.ndarray:
+        """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
         centre = to_vector(self.searched)
         actions = []
         try:
             for i, theta in enumerate(self.thetas):
                 parameters.write(self.searched, theta)
-                action, _ = self.policy.predict(row(obs, i), deterministic=self.deterministic)
+                action, _ = self.policy.predict(take(obs, slice(i, i + 1)), deterministic=self.deterministic)
                 actions.append(action)
         finally:
             parameters.write(self.searched, centre)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 
 
-class MatrixActor(CandidateActor):
+class MatrixActor:
     """Batched matrix products, for the layers of a plain actor."""
 
     def __init__(
@@ -92,15 +81,12 @@ class MatrixActor(CandidateActor):
             values = parameter.detach()
             return values.mT.repeat(n_envs, 1, 1).mT if values.dim() == 2 else values.repeat(n_envs, 1)
 
-        self.stacks = [stacked(parameter) for parameter in searched]
-        stack_of = {id(parameter): stack for parameter, stack in zip(searched, self.stacks, strict=True)}
-
-        def values(parameter: th.Tensor) -> th.Tensor:
-            """The stack of a searched parameter; a frozen one has the same values in all environments."""
-            return stack_of[id(parameter)] if id(parameter) in stack_of else stacked(parameter)
-
+        # Frozen parameters too, with the same values in all environments
+        values = [parameter for layer in layers for parameter in layer.parameters()]
+        stacks: dict[th.Tensor, th.Tensor] = {parameter: stacked(parameter) for parameter in values}
+        self.stacks = [stacks[parameter] for parameter in searched]
         self.operations = [
-            (values(layer.weight).mT, values(layer.bias)[:, None]) if isinstance(layer, th.nn.Linear) else layer
+            (stacks[layer.weight].mT, stacks[layer.bias][:, None]) if isinstance(layer, th.nn.Linear) else layer
             for layer in layers
         ]
 
@@ -109,15 +95,12 @@ class MatrixActor(CandidateActor):
             stack[envs] = values
 
     def act(self, obs: Any) -> np.ndarray:
-        policy = self.policy
         outputs = self.outputs(obs)
         if self.deterministic:
-            actions = mode(outputs, policy.action_space)
-        elif isinstance(policy.action_dist, DiagGaussianDistribution):
-            actions = policy.action_dist.proba_distribution(outputs, policy.log_std.detach()).sample()
+            actions = mode(outputs, self.policy.action_space)
         else:
-            actions = policy.action_dist.proba_distribution(action_logits=outputs).sample()
-        shape: Any = policy.action_space.shape
+            actions = distribution_of(self.policy, outputs).sample().detach()
+        shape: Any = self.policy.action_space.shape
         return self.as_env_actions(actions.cpu().numpy().reshape(-1, *shape))
 
     def outputs(self, obs: Any) -> th.Tensor:
@@ -143,11 +126,8 @@ class MatrixActor(CandidateActor):
         )
 
 
-def row(obs: Any, i: int) -> Any:
-    """Observation i as a batch of one."""
-    if isinstance(obs, dict):
-        return {key: part[i : i + 1] for key, part in obs.items()}
-    return obs[i : i + 1]
+# Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters
+CandidateActor: TypeAlias = LoopActor | MatrixActor
 
 
 def make_candidate_actor(

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_reinforce.envs.checks import all_finite, format_number, is_finite
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
@@ -42,8 +42,7 @@ class EpisodeTracker:
     def __init__(self, queue: list[Pair], n_envs: int, max_episode_steps: int):
         self.pairs = queue[:n_envs]
         self.waiting = queue[n_envs:]
-        self.n_active = len(self.pairs)
-        self.active = np.arange(n_envs) < self.n_active
+        self.active = np.arange(n_envs) < len(self.pairs)
         self.totals = np.zeros(n_envs)
         self.clock = 0
         self.started_at = np.zeros(n_envs, dtype=int)
@@ -54,7 +53,7 @@ class EpisodeTracker:
         """Add a step, after checking that its numbers are finite and that no episode is longer than allowed."""
         self.totals += rewards
         self.check("The reward", rewards)
-        self.check_observations(obs)
+        self.check("The observation", obs)
         self.clock += 1
         if self.clock > self.deadline:
             late = int(np.argmax(self.active & (self.started_at + self.max_episode_steps == self.deadline)))
@@ -63,16 +62,12 @@ class EpisodeTracker:
                 f"({self.describe(late)}): give the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
             )
 
-    def check_observations(self, obs: Any) -> None:
-        """Check that observations, or the parts of dicts, are finite."""
-        if isinstance(obs, dict):
-            for key, part in obs.items():
-                self.check(f"The observation {key!r}", part)
-        else:
-            self.check("The observation", obs)
-
-    def check(self, name: str, values: np.ndarray) -> None:
-        """Check that numbers of shape ``(n_envs, ...)`` are finite where a candidate acts."""
+    def check(self, name: str, values: Any) -> None:
+        """Check that numbers of shape ``(n_envs, ...)``, or dicts of them, are finite where a candidate acts."""
+        if isinstance(values, dict):
+            for key, part in values.items():
+                self.check(f"{name} {key!r}", part)
+            return
         if all_finite(values):
             return
         bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
@@ -93,7 +88,6 @@ class EpisodeTracker:
             else:
                 # Its last candidate acts on in it: these steps are counted, and otherwise ignored
                 self.active[env] = False
-                self.n_active -= 1
         self.deadline = self.max_episode_steps + int(self.started_at[self.active].min(initial=self.clock))
         return restarted
 
@@ -111,9 +105,9 @@ def evaluate_candidates(
     n_episodes: int,
     max_episode_steps: int,
     on_step: Callable[[CandidateStep], None],
-    vec_normalize: VecNormalize | None = None,
 ) -> np.ndarray:
     """The returns Σ_t r_t, unscaled, of candidates ``(m, n)`` from seeds ``(m, n_episodes)``, in the seeds' shape."""
+    vec_normalize = unwrap_vec_normalize(env)
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))
     if seeds is not None:
@@ -122,9 +116,10 @@ def evaluate_candidates(
     for queue in schedule_episodes(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         tracker = EpisodeTracker(queue, env.num_envs, max_episode_steps)
         obs = start_episodes(env, tracker.pairs, seeds)
-        tracker.check_observations(obs)
+        tracker.check("The observation", obs)
         started = list(range(len(tracker.pairs)))
-        while tracker.n_active:
+        # any() costs several times as much on a few numbers
+        while np.count_nonzero(tracker.active):
             if started:
                 actor.assign(started, thetas[[tracker.pairs[i][0] for i in started]])
                 started = []
@@ -132,7 +127,6 @@ def evaluate_candidates(
             tracker.add(rewards if original is None else original(), obs)
             finished = dones & tracker.active
             on_step(CandidateStep(obs, rewards, dones, infos, finished))
-            # any() costs several times as much on a few numbers
             if np.count_nonzero(finished):
                 started = tracker.finish(finished, returns)
     return returns

@@ -2,7 +2,6 @@
 
 import warnings
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -13,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
+from sb3_reinforce.common.tensors import take
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.policies.evaluation import Route, route_of
 from sb3_reinforce.sampling.actors import Actor, make_actor
@@ -25,7 +25,6 @@ TerminalObs: TypeAlias = dict[tuple[int, int], Any]
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
 
-@dataclass(frozen=True)
 class Extent:
     """
     When a rollout is complete: after ``n_steps`` per environment, or with ``quota`` episodes of each environment.
@@ -33,37 +32,31 @@ class Extent:
     An episode that is waited for and lasts longer than ``max_episode_steps`` counts as one that never ends.
     """
 
-    n_steps: float
-    quota: NDArray[np.integer]
-    max_episode_steps: float
+    def __init__(self, quota: NDArray[np.integer], n_steps: float = np.inf, max_episode_steps: float = np.inf):
+        self.quota = quota
+        self.n_steps = n_steps
+        self.max_episode_steps = max_episode_steps
+        self.remaining = quota.copy()
+        self.starts = np.zeros_like(quota)
+        self.deadline = max_episode_steps
+        self.is_complete = False
 
     @classmethod
     def fixed(cls, n_steps: int, n_envs: int) -> "Extent":
         """The same number of steps in every environment, and as many episodes as end in them."""
-        return cls(n_steps, np.full(n_envs, n_steps), np.inf)
+        return cls(np.full(n_envs, n_steps), n_steps=n_steps)
 
     @classmethod
     def whole_episodes(cls, n_episodes: int, n_envs: int, max_episode_steps: int) -> "Extent":
         """Quotas that differ by at most 1, fixed beforehand: "the first to finish" would favour short episodes."""
         quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
-        return cls(np.inf, quota, max_episode_steps)
-
-
-class Quota:
-    """The episodes that a rollout still waits for."""
-
-    def __init__(self, extent: Extent, n_envs: int):
-        self.extent = extent
-        self.remaining = extent.quota.copy()
-        self.starts = np.zeros(n_envs, dtype=int)
-        self.deadline = extent.max_episode_steps
-        self.is_complete = False
+        return cls(quota, max_episode_steps=max_episode_steps)
 
     def check_length(self, n_steps: int) -> None:
         """Refuse an episode that never ends."""
         if n_steps == self.deadline:
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.extent.max_episode_steps} steps, and whole "
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and whole "
                 "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
             )
 
@@ -72,9 +65,9 @@ class Quota:
         counted = np.flatnonzero(dones & (self.remaining > 0))
         self.remaining[counted] -= 1
         self.starts[counted] = n_steps
-        if self.extent.n_steps == np.inf:
+        if self.n_steps == np.inf:
             self.is_complete = not self.remaining.any()
-            self.deadline = self.extent.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
+            self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
         return list(counted.tolist())
 
 
@@ -94,16 +87,16 @@ def collect(
     them.
     """
     policy = model.policy
-    is_attached = has_callback(callback)
+    # For callback=None Stable-Baselines3 installs a no-op, which need not be called
+    is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
     actor = make_actor(policy, route, env.num_envs, keep_outputs=is_attached)
     as_env_actions = env_actions_of(policy, env.num_envs)
-    quota = Quota(extent, env.num_envs)
     # A copy: some VecEnvs reuse the array of the dones
     starts = [np.array(model._last_episode_starts, dtype=bool)]
     terminal_obs: TerminalObs = {}
     n_steps = first_row = 0
-    while n_steps < extent.n_steps and not quota.is_complete:
-        quota.check_length(n_steps)
+    while n_steps < extent.n_steps and not extent.is_complete:
+        extent.check_length(n_steps)
         if n_steps == rollout_buffer.buffer_size:
             resize(rollout_buffer, 2 * n_steps)
         if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
@@ -133,7 +126,7 @@ def collect(
         n_steps += 1
         rollout_buffer.pos = n_steps
         if np.count_nonzero(dones):
-            counted = quota.count(starts[-1], n_steps)
+            counted = extent.count(starts[-1], n_steps)
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
             for i in counted:
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
@@ -152,11 +145,6 @@ def collect(
     return np.array(starts[1:]), terminal_obs
 
 
-def has_callback(callback: BaseCallback) -> bool:
-    """Whether a user's callback is attached; for ``callback=None`` SB3 installs a no-op, which need not be called."""
-    return not (type(callback) is ConvertCallback and callback.callback is None)
-
-
 def write_row(rows: Any, step: int, values: Any) -> None:
     """``rows[step] = values``, for an array of shape ``(n_steps, n_envs, ...)`` or a dict of them."""
     if isinstance(rows, dict):
@@ -171,26 +159,24 @@ def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None
     """Write log π of the rows from ``first_row`` on, unless the actor has computed them along with the actions."""
     rows = slice(first_row, buffer.pos)
     obs: Any = buffer.observations
-    obs = {key: part[rows] for key, part in obs.items()} if isinstance(obs, dict) else obs[rows]
-    log_probs = actor.log_prob(obs, buffer.actions[rows]) if first_row < buffer.pos else None
+    log_probs = actor.log_prob(take(obs, rows), buffer.actions[rows]) if first_row < buffer.pos else None
     if log_probs is not None:
         buffer.log_probs[rows] = log_probs.reshape(-1, buffer.n_envs)
 
 
 def resize(buffer: RolloutBuffer, n_steps: int) -> None:
-    """Give a rollout buffer ``n_steps`` rows, and keep the rows that it has."""
+    """Cut a rollout buffer to ``n_steps`` rows, or double it to that number."""
 
     def resized(rows: Any) -> Any:
         if isinstance(rows, dict):
             return {key: resized(part) for key, part in rows.items()}
         if n_steps <= len(rows):
             return rows[:n_steps]
-        return np.concatenate([rows, np.zeros((n_steps - len(rows), *rows.shape[1:]), dtype=rows.dtype)])
+        return np.concatenate([rows, np.zeros_like(rows)])
 
-    if n_steps != buffer.buffer_size:
-        for name in ROWS:
-            setattr(buffer, name, resized(getattr(buffer, name)))
-        buffer.buffer_size = n_steps
+    for name in ROWS:
+        setattr(buffer, name, resized(getattr(buffer, name)))
+    buffer.buffer_size = n_steps
 
 
 def by_step(buffer: RolloutBuffer) -> tuple[np.ndarray, np.ndarray]:

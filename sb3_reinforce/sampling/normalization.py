@@ -24,12 +24,6 @@ class ObservationStatistics:
             for key, seen in self.seen.items():
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
-    def hand_over(self) -> None:
-        """Add all of them to the statistics of the VecNormalize."""
-        for key, seen in self.seen.items():
-            if seen.count:
-                self.totals[key].combine(seen)
-
 
 @contextmanager
 def frozen(vec_normalize: VecNormalize | None) -> Iterator[ObservationStatistics | None]:
@@ -43,4 +37,6 @@ def frozen(vec_normalize: VecNormalize | None) -> Iterator[ObservationStatistics
         yield observed
     finally:
         vec_normalize.training = True
-    observed.hand_over()
+    for key, seen in observed.seen.items():
+        if seen.count:
+            observed.totals[key].combine(seen)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,25 +19,22 @@ class Stopped(Exception):
     """A callback returned False; it ends an update from inside the estimator."""
 
 
+@dataclass
 class EpisodicUtility:
     """U(θ) = E[Σ_t r_t] by episodes in a FiniteDifference's environments; it keeps all candidates and their values."""
 
-    def __init__(
-        self,
-        model: Any,
-        searched: Sequence[th.nn.Parameter],
-        callback: BaseCallback,
-        observed: ObservationStatistics | None,
-        first_seed: int,
-    ):
-        self.model = model
-        self.actor = make_candidate_actor(model.policy, searched, model.n_envs, model.deterministic)
-        self.n_parameters = sum(parameter.numel() for parameter in searched)
-        self.callback = callback
-        self.observed = observed
-        self.first_seed = first_seed
-        self.candidates: list[th.Tensor] = []
-        self.values: list[th.Tensor] = []
+    model: Any
+    searched: Sequence[th.nn.Parameter]
+    callback: BaseCallback
+    observed: ObservationStatistics | None
+    first_seed: int
+    candidates: list[th.Tensor] = field(default_factory=list)
+    values: list[th.Tensor] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        model = self.model
+        self.actor = make_candidate_actor(model.policy, self.searched, model.n_envs, model.deterministic)
+        self.n_parameters = sum(parameter.numel() for parameter in self.searched)
         if model.verbose >= 1 and model._n_updates == 0 and isinstance(self.actor, LoopActor):
             print(f"{type(model.policy).__name__} is not a plain MLP: candidates act one by one, which is slower")
 
@@ -56,7 +54,6 @@ class EpisodicUtility:
             n_episodes,
             model.max_episode_steps,
             self._on_step,
-            model.get_vec_normalize_env(),
         )
         values = th.as_tensor(returns).mean(1)
         self.candidates.append(thetas)

@@ -1,6 +1,7 @@
 """Each argument is checked at construction, by load, by set_env and by learn; the error names it."""
 
 from contextlib import suppress
+from functools import partial
 from inspect import signature
 
 import gymnasium as gym
@@ -30,11 +31,9 @@ WRONG = {
     "check_integer": [*NO_NUMBERS, NAN, INF, 2.5, 2**63],
     "check_flag": ["no", 1, None],
     "check_choice": ["batch", 3, None],
-    "check_name": [3, None, b"mean"],
-    "check_kind": [3, [1]],
+    "check_kind": [3, [1], None, b"mean"],
     "check_subclass": [3, "x", dict],
     "check_device": ["gpu9", 3],
-    "check_policy": [3, None],
     "check_callback": [3, "x", [3], BaseCallback, [BaseCallback]],
 }
 
@@ -51,7 +50,7 @@ def wrong_values(check):
         values.append(keywords["high"] * 1.1)
     if keywords.get("above"):
         values.append(keywords["low"])
-    if not keywords.get("finite", True):
+    if keywords.get("high") == INF:
         values.remove(INF)
     return values
 
@@ -161,16 +160,16 @@ def test_the_search_recommends_the_cpu(policy):
 @pytest.mark.parametrize(
     ("check", "wrong", "allowed"),
     [
-        (arguments.number(), INF, "finite"),
-        (arguments.number(0), -1, "finite and >= 0"),
-        (arguments.number(0, above=True), 0, "finite and > 0"),
-        (arguments.number(0, 1), 2, r"in \[0, 1\]"),
-        (arguments.schedule(0, 1, above=True), 0.0, r"in \(0, 1\]"),
-        (arguments.integer(2), 1, "at least 2"),
-        (arguments.integer(2, 5), 6, "at least 2 and at most 5"),
-        (arguments.schedule(), "1e-3", "a number or a schedule"),
-        (arguments.choice("a", "b"), "c", "one of 'a', 'b'"),
-        (arguments.kind(int, str), None, "int or str"),
+        (arguments.check_number, INF, "finite"),
+        (partial(arguments.check_number, low=0), -1, "finite and >= 0"),
+        (partial(arguments.check_number, low=0, above=True), 0, "finite and > 0"),
+        (partial(arguments.check_number, low=0, high=1), 2, r"in \[0, 1\]"),
+        (partial(arguments.CheckedSchedule, low=0, high=1, above=True), 0.0, r"in \(0, 1\]"),
+        (partial(arguments.check_integer, low=2), 1, "at least 2"),
+        (partial(arguments.check_integer, low=2, high=5), 6, "at least 2 and at most 5"),
+        (partial(arguments.CheckedSchedule, low=0), "1e-3", "a number or a schedule"),
+        (partial(arguments.check_choice, choices=("a", "b")), "c", "one of 'a', 'b'"),
+        (partial(arguments.check_kind, kinds=(int, str)), None, "int or str"),
     ],
 )
 def test_the_message_says_what_is_allowed(check, wrong, allowed):
