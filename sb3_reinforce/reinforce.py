@@ -89,14 +89,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
-    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. One that falls to 0
-        leaves a policy that is as good without its noise, as it is evaluated
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. A
+        schedule that falls to 0 ends with an almost deterministic policy, which is how policies are evaluated
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor
     :param max_episode_steps: With ``n_episodes``, the length beyond which an episode counts as one that never ends
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE) instead of action noise
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only before each rollout
-    :param rollout_buffer_class: Rollout buffer class to use. Its arrays are written in place: ``add`` and
+    :param rollout_buffer_class: Rollout buffer class to use. Its arrays are written in place: ``add``, ``get`` and
         ``compute_returns_and_advantage`` are not called
     :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
     :param normalize_advantage: Scale G_t − b_t to mean 0 and standard deviation 1 per rollout; skipped below two
@@ -191,7 +191,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.min_std = min_std
         self.max_episode_steps = max_episode_steps
         self.normalize_advantage = normalize_advantage
-        #: The last rollout; None before the first one, and after one that was broken off
+        #: The last rollout; None before the first one, while one is collected, and after an interrupted one
         self.rollout: Rollout | None = None
         #: Whether a rollout is being collected, so that its environments must be left alone
         self.is_collecting = False
@@ -270,7 +270,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
-        if n_rollout_steps is None and not np.all(self._last_episode_starts):
+        # A measurement that failed in a callback leaves no observation
+        if self._last_obs is None or (n_rollout_steps is None and not np.all(self._last_episode_starts)):
             self._last_obs = env.reset()  # type: ignore[assignment]
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         if np.all(self._last_episode_starts):
@@ -286,7 +287,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             collected = collect(self, env, callback, rollout_buffer, extent, route)
             if collected is None:
                 return False
-            dones, terminal_obs = collected
+            dones, terminal_obs, route = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
             next_values = None
             if route.with_critic:
@@ -388,6 +389,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.critic_optimizer,
             critic,
             batch.observations,
+            batch.actions,
             batch.returns,
             self.n_critic_updates,
             self.batch_size,
@@ -449,7 +451,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_sorted_parameters", "rollout"]
+        return [*super()._excluded_save_params(), "_sorted_parameters", "rollout", "is_collecting"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

@@ -70,4 +70,5 @@ def fuse(optimizer: th.optim.Optimizer) -> None:
     """Let Adam and AdamW take their step in one kernel, unless the user has chosen another implementation."""
     if type(optimizer) in (th.optim.Adam, th.optim.AdamW):
         for group in optimizer.param_groups:
-            group["fused"] = group["fused"] is not False and not group["foreach"]
+            has_chosen = group["fused"] is False or group["foreach"] or group["differentiable"]
+            group["fused"] = not has_chosen

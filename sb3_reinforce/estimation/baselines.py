@@ -59,7 +59,8 @@ def leave_one_out(rollout: Rollout) -> th.Tensor:
     """
     ``b_t = mean of G_t over the other episodes that reach step t``, and 0 where there is none.
 
-    Unbiased: the other episodes know nothing of this one's action (Kool et al., 2019, "Buy 4 REINFORCE samples").
+    Unbiased: the returns of other episodes do not depend on this one's actions (Kool et al., 2019, "Buy 4 REINFORCE
+    samples").
 
     :param rollout: The rollout
     :return: b_t

@@ -21,7 +21,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten, select, take, to_vector
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.policies.evaluation import Parameters, depends_on, extract_features, log_prob_and_entropy
-from sb3_reinforce.policies.plain_mlp import divide, overrides, plain_actor
+from sb3_reinforce.policies.plain_mlp import divide, plain_actor
 
 # Floats that an intermediate result may take, 128 MiB in float32
 CHUNK = 2**25
@@ -119,7 +119,7 @@ def scored_parameters(rollout: Rollout) -> Parameters:
 def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     """The layers of a plain actor, or None if the scores of its parameters have no factors."""
     layers = plain_actor(policy)
-    if layers is None or overrides(policy, "evaluate_actions"):
+    if layers is None:
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
     is_shared = len({id(parameter) for parameter in parameters}) < len(parameters)

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.tensors import flatten, stack, take
-from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features
+from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, has_own_forward
 from sb3_reinforce.policies.plain_mlp import evaluate_layers, overrides
 
 Value: TypeAlias = Callable[[Any], th.Tensor]
@@ -67,6 +67,7 @@ def fit_critic(
     optimizer: th.optim.Optimizer,
     parameters: Parameters,
     obs: PyTorchObs,
+    actions: th.Tensor,
     returns: th.Tensor,
     n_updates: int,
     batch_size: int,
@@ -81,12 +82,12 @@ def fit_critic(
     if not parameters:
         return 0.0
     losses = []
-    inputs, value = regression(policy, route, parameters, obs)
+    value = value_of_batch(policy, route, parameters, obs, actions)
     with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
             for batch in minibatches(len(returns), batch_size, returns.device):
                 # L = mean_t (G_t − V(s_t))²
-                loss = F.mse_loss(value(take(inputs, batch)).flatten(), returns[batch])
+                loss = F.mse_loss(value(batch).flatten(), returns[batch])
                 gradients = th.autograd.grad(loss, parameters)
                 optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
                 losses.append(loss.detach())
@@ -100,23 +101,26 @@ def minibatches(n: int, size: int, device: th.device) -> Sequence[th.Tensor | sl
     return th.randperm(n).to(device).split(size)  # type: ignore[no-untyped-call, no-any-return]
 
 
-def regression(
-    policy: ActorCriticPolicy, route: Route, parameters: Parameters, obs: PyTorchObs
-) -> tuple[PyTorchObs, Value]:
+def value_of_batch(
+    policy: ActorCriticPolicy, route: Route, parameters: Parameters, obs: PyTorchObs, actions: th.Tensor
+) -> Value:
     """
-    Inputs of the critic's passes, and V as a function of them.
+    V of the steps with given indices, as the critic's passes evaluate it.
 
-    The inputs are cached features if the passes do not change the features extractor: they are the same in every pass.
+    The features are computed once if the passes do not change the features extractor: they are the same in every pass.
     """
+    layers = route.critic
     extractor = policy.vf_features_extractor
     trained = {id(parameter) for parameter in parameters}
+    if layers is None and (has_own_forward(policy) or overrides(policy, "evaluate_actions")):
+        # V of such a policy may only be found along with log π
+        return lambda batch: policy.evaluate_actions(take(obs, batch), actions[batch])[0]
     # In training mode Dropout draws new masks for each pass, and BatchNorm looks at each minibatch
-    is_fixed = route.critic is not None or type(extractor) is FlattenExtractor or not extractor.training
+    is_fixed = layers is not None or type(extractor) is FlattenExtractor or not extractor.training
     if overrides(policy, "predict_values") or not is_fixed or not trained.isdisjoint(map(id, extractor.parameters())):
-        return obs, policy.predict_values
+        return lambda batch: policy.predict_values(take(obs, batch))
     with th.no_grad():
         features = extract_features(policy, obs, extractor)
-    layers = route.critic
     if layers is not None:
-        return features, lambda features: evaluate_layers(layers, features)
-    return features, lambda features: policy.value_net(policy.mlp_extractor.forward_critic(features))
+        return lambda batch: evaluate_layers(layers, features[batch])
+    return lambda batch: policy.value_net(policy.mlp_extractor.forward_critic(features[batch]))

@@ -6,7 +6,7 @@ A method that a user has overridden is called as it is. Where nothing is overrid
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
@@ -27,7 +27,7 @@ from sb3_reinforce.policies.plain_mlp import (
 
 Parameters: TypeAlias = list[nn.Parameter]
 
-# At this temperature the logits of float32 networks leave one action
+# At this temperature the logits of float32 networks put all probability on one action
 MIN_TEMPERATURE = 1e-3
 
 
@@ -58,27 +58,32 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     actor = plain_actor(policy)
     critic = plain_critic(policy) if with_critic else None
     if actor is not None:
-        return Route(with_critic, actor, critic, forward=False, evaluate_actions=overrides(policy, "evaluate_actions"))
-    has_hooks = (
-        bool(hooks_of(policy)) or bool(hooks_of(policy.mlp_extractor)) or "forward" in vars(policy.mlp_extractor)
-    )
-    own_features = overrides(policy, "extract_features")
+        return Route(with_critic, actor, critic, forward=False, evaluate_actions=False)
     own_parts = overrides(policy, "predict_values", "get_distribution")
     shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
     together = with_critic and shares and not own_parts
+    own_forward = has_own_forward(policy)
     return Route(
         with_critic,
         actor=None,
         critic=critic,
-        forward=overrides(policy, "forward") or own_features or has_hooks or together,
-        evaluate_actions=overrides(policy, "evaluate_actions") or own_features or has_hooks or together,
+        forward=own_forward or overrides(policy, "forward") or together,
+        evaluate_actions=own_forward or overrides(policy, "evaluate_actions") or together,
     )
+
+
+def has_own_forward(policy: ActorCriticPolicy) -> bool:
+    """Whether ``get_distribution`` and ``predict_values`` would bypass code or hooks that ``forward`` calls."""
+    if overrides(policy, "extract_features") or hooks_of(policy):
+        return True
+    mlp = getattr(policy, "mlp_extractor", None)
+    return isinstance(mlp, nn.Module) and (bool(hooks_of(mlp)) or "forward" in vars(mlp))
 
 
 def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.Module) -> th.Tensor:
     """The features of ``n`` observations by one of the policy's extractors, shape ``(n, features_dim)``."""
     if isinstance(obs, th.Tensor) and takes_vectors(policy, extractor):
-        # The result of the line below, for a tenth of its price
+        # The result of the line below, at a tenth of the cost
         return obs.flatten(1).float()
     return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
 
@@ -132,7 +137,9 @@ def split_parameters(
     """
     parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
-    in_critic = depends_on(policy.predict_values(obs), parameters)
+    route = route_of(policy, with_critic=True)
+    values = evaluate(policy, route, obs, actions, with_values=True)[2]
+    in_critic = depends_on(cast(th.Tensor, values), parameters)
     table = list(zip(parameters, in_actor, in_critic, strict=True))
     return (
         [parameter for parameter, actor, _ in table if actor],

@@ -24,11 +24,14 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
     training = policy.training
     policy.set_training_mode(False)
-    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], trainable)
-    with th.no_grad():
-        # A policy keeps its last distribution, and with the graph in it could not be deep-copied
-        log_prob_and_entropy(policy, obs, actions)
-    policy.set_training_mode(training)
+    try:
+        with th.enable_grad():
+            in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], trainable)
+        with th.no_grad():
+            # A policy keeps its last distribution, and with the graph in it could not be deep-copied
+            log_prob_and_entropy(policy, obs, actions)
+    finally:
+        policy.set_training_mode(training)
     searched = [parameter for parameter, is_searched in zip(trainable, in_actor, strict=True) if is_searched]
     if not searched:
         raise ValueError(

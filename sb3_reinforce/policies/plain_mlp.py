@@ -1,5 +1,5 @@
 """
-Plain MLPs: which actors and critics are known to be one, and their forward pass without the price of modules.
+Plain MLPs: which actors and critics are known to be one, and their forward pass without the overhead of modules.
 
 A network is plain only if everything on the way from the observation to its output is an unchanged object of
 Stable-Baselines3 or PyTorch. A hook, a replaced method or a class of the user makes it general, and then the policy
@@ -23,7 +23,6 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
     CombinedExtractor,
     FlattenExtractor,
     MlpExtractor,
@@ -75,7 +74,6 @@ def methods_of(cls: Any) -> frozenset[str]:
     return frozenset(name for name in dir(cls) if callable(getattr(cls, name, None)))
 
 
-@lru_cache
 def own_methods(cls: type, base: type) -> frozenset[str]:
     """The methods of ``base`` that a class overrides; all of them if it is no subclass, as a compiled policy."""
     if base not in cls.__mro__:
@@ -106,32 +104,32 @@ def plain_actor(policy: ActorCriticPolicy) -> list[nn.Module] | None:
 
     They are ``Linear`` layers with a bias and elementwise activations, and the features are the observations in a row.
     """
-    if type(policy.action_dist) not in DISTRIBUTIONS or not is_unchanged(policy.action_dist):
+    distribution = getattr(policy, "action_dist", None)
+    if type(distribution) not in DISTRIBUTIONS or not is_unchanged(distribution):
         return None
-    return plain_layers(policy, policy.pi_features_extractor, "policy_net", policy.action_net)
+    return plain_layers(policy, "pi_features_extractor", "policy_net", "action_net")
 
 
 def plain_critic(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     """The layers from the features to V of a policy whose critic is known to be plain, else None."""
-    return plain_layers(policy, policy.vf_features_extractor, "value_net", policy.value_net)
+    return plain_layers(policy, "vf_features_extractor", "value_net", "value_net")
 
 
-def plain_layers(
-    policy: ActorCriticPolicy, extractor: BaseFeaturesExtractor, net: str, head: nn.Module
-) -> list[nn.Module] | None:
+def plain_layers(policy: ActorCriticPolicy, extractor: str, net: str, head: str) -> list[nn.Module] | None:
     """The layers after the features extractor, or None if anything on the way is not known to be plain."""
-    mlp = policy.mlp_extractor
+    # A user's policy may lack any of these parts
+    mlp = getattr(policy, "mlp_extractor", None)
     if own_methods(type(policy), ActorCriticPolicy) - CONSTRUCTION or type(mlp) is not MlpExtractor:
         return None
     body = getattr(mlp, net)
-    if type(body) is not nn.Sequential or not is_plain_extractor(extractor):
+    if type(body) is not nn.Sequential or not is_plain_extractor(getattr(policy, extractor, None)):
         return None
-    layers = [*body, head]
+    layers = [*body, getattr(policy, head, None)]
     is_plain = all(map(is_plain_layer, layers)) and all(map(is_unchanged, (policy, mlp, body, *layers)))
     return layers if is_plain else None
 
 
-def is_plain_extractor(extractor: nn.Module) -> bool:
+def is_plain_extractor(extractor: Any) -> bool:
     """Whether a features extractor only puts numbers in a row."""
     parts: Iterable[nn.Module] = ()
     if type(extractor) is FlattenExtractor:
@@ -143,7 +141,7 @@ def is_plain_extractor(extractor: nn.Module) -> bool:
     return is_unchanged(extractor) and all(type(part) is nn.Flatten and is_unchanged(part) for part in parts)
 
 
-def is_plain_layer(layer: nn.Module) -> bool:
+def is_plain_layer(layer: Any) -> bool:
     """Whether a layer is linear with a bias, or an elementwise activation."""
     return type(layer) in ELEMENTWISE or (type(layer) is nn.Linear and layer.bias is not None)
 

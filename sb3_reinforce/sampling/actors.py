@@ -21,8 +21,8 @@ from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten
-from sb3_reinforce.policies.evaluation import Route, distribution_of, evaluate
-from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, takes_vectors
+from sb3_reinforce.policies.evaluation import Route, distribution_of, evaluate, has_own_forward
+from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, overrides, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
@@ -58,7 +58,8 @@ class PolicyActor:
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy would still act as this actor does."""
-        return policy is self.policy
+        forward = has_own_forward(policy) or overrides(policy, "forward")
+        return policy is self.policy and (self.route.forward or not forward)
 
 
 class NumpyActor:
@@ -73,11 +74,13 @@ class NumpyActor:
         self.outputs: list[Floats] = []
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
-        mlp = policy.mlp_extractor
-        extractor = policy.pi_features_extractor
-        parts = [policy, mlp, mlp.policy_net, extractor, *extractor.children(), *layers]
+        self.distribution = policy.action_dist
+        self.mlp_extractor = policy.mlp_extractor
+        self.extractor = policy.pi_features_extractor
+        body = policy.mlp_extractor.policy_net
+        parts = [policy, self.mlp_extractor, body, self.extractor, *self.extractor.children(), *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
-        self.dicts = [vars(policy.action_dist), *map(vars, parts), *hooks]
+        self.dicts = [vars(self.distribution), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
@@ -93,10 +96,13 @@ class NumpyActor:
         return distribution_of(self.policy, outputs).log_prob(rows).cpu().numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
-        # A hook or a replaced method adds an entry to a dict, and other parameters lie elsewhere
+        # A hook or a replaced method adds an entry to a dict; other parts and parameters are other objects
         return (
             policy is self.policy
             and sum(map(len, self.dicts)) == self.n_entries
+            and policy.action_dist is self.distribution
+            and policy.pi_features_extractor is self.extractor
+            and policy.mlp_extractor is self.mlp_extractor
             and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers
             and addresses_of(policy, self.layers) == self.addresses
         )

@@ -2,6 +2,7 @@
 
 import warnings
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -78,13 +79,13 @@ def collect(
     rollout_buffer: RolloutBuffer,
     extent: Extent,
     route: Route,
-) -> tuple[Bools, TerminalObs] | None:
+) -> tuple[Bools, TerminalObs, Route] | None:
     """
     Step the environments and write what happens into a rollout buffer, which ends with one row per step.
 
-    Returns ``dones`` of shape ``(n_steps, n_envs)`` and the terminal observations at time limits, or None if the
-    callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them: training has no use for
-    them.
+    Returns ``dones`` of shape ``(n_steps, n_envs)``, the terminal observations at time limits and the route to the
+    values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them:
+    training has no use for them.
     """
     policy = model.policy
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
@@ -135,14 +136,17 @@ def collect(
         if is_attached and not actor.is_current(model.policy):
             write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
-            actor = make_actor(policy, route_of(policy, route.with_critic), env.num_envs)
+            route = route_of(policy, route.with_critic)
+            actor = make_actor(policy, route, env.num_envs)
+            # The values of the rows so far came from another policy: they are computed in one batch instead
+            route = replace(route, forward=False)
             first_row = n_steps
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
     rollout_buffer.episode_starts[:] = starts[:-1]
     if is_attached:
         write_log_probs(rollout_buffer, actor, first_row)
-    return np.array(starts[1:]), terminal_obs
+    return np.array(starts[1:]), terminal_obs, route
 
 
 def write_row(rows: Any, step: int, values: Any) -> None:
@@ -188,7 +192,7 @@ def by_step(buffer: RolloutBuffer) -> tuple[np.ndarray, np.ndarray]:
 
 def warn_of_own_methods(buffer: RolloutBuffer) -> None:
     """Warn if a user's rollout buffer overrides a method that is not called."""
-    for name in ("add", "compute_returns_and_advantage"):
+    for name in ("add", "get", "compute_returns_and_advantage"):
         if getattr(type(buffer), name) not in (getattr(RolloutBuffer, name), getattr(DictRolloutBuffer, name)):
             warnings.warn(
                 f"rollout_buffer_class={type(buffer).__name__} overrides {name}, which is not called: the buffer's "

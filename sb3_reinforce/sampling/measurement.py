@@ -22,7 +22,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
             "in on_rollout_end, or after training"
         )
     env = cast(VecEnv, model.env)
-    # Whatever ends the block, a model without an observation resets its environments before it goes on
+    # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
     with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
         yield

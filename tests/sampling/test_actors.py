@@ -10,7 +10,7 @@ import torch as th
 from callbacks import At
 from environments import Corridor
 from gymnasium import spaces
-from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -205,7 +205,17 @@ def new_method(model):
     model.policy.action_net.forward = lambda x: forward(x) + OFFSET
 
 
+class Preferring(CategoricalDistribution):
+    def proba_distribution(self, action_logits):
+        return super().proba_distribution(action_logits + OFFSET)
+
+
+def new_distribution(model):
+    model.policy.action_dist = Preferring(2)
+
+
 HOWS = {
+    "distribution": new_distribution,
     "values": prefer,
     "policy": new_policy,
     "layer": new_layer,

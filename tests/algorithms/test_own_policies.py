@@ -1,0 +1,94 @@
+"""Policies that are not built as Stable-Baselines3 builds them, or that a callback exchanges during a rollout."""
+
+import numpy as np
+import pytest
+import torch as th
+from callbacks import At, Record
+from environments import Corridor
+from models import KINDS, make
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import compare_baselines, landscape
+
+
+class WithoutParts(ActorCriticPolicy):
+    """Has neither an ``mlp_extractor`` nor an ``action_net``."""
+
+    def _build(self, lr_schedule):
+        self.actor = th.nn.Linear(self.features_dim, self.action_space.n)
+        self.critic = th.nn.Linear(self.features_dim, 1)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    def get_distribution(self, obs):
+        return self.action_dist.proba_distribution(self.actor(self.extract_features(obs)))
+
+    def predict_values(self, obs):
+        return self.critic(self.extract_features(obs))
+
+    def forward(self, obs, deterministic=False):
+        distribution = self.get_distribution(obs)
+        actions = distribution.get_actions(deterministic=deterministic)
+        return actions, self.predict_values(obs), distribution.log_prob(actions)
+
+    def evaluate_actions(self, obs, actions):
+        distribution = self.get_distribution(obs)
+        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_policy_without_the_usual_parts_trains(kind):
+    assert make(kind, Corridor((3,)), WithoutParts, policy_kwargs={}).learn(32)._n_updates > 0
+
+
+class Ones(ActorCriticPolicy):
+    """Its features are 1 in ``forward`` and ``evaluate_actions``, but not in Stable-Baselines3's ``predict_values``."""
+
+    def extract_features(self, obs, features_extractor=None):
+        return th.ones_like(super().extract_features(obs, features_extractor))
+
+
+def test_the_critic_is_fitted_to_the_values_that_are_the_baseline():
+    env = Corridor((1,), reward=lambda t, action: 5.0)
+    model = REINFORCE(Ones, env, n_steps=16, learning_rate=0.02, seed=0, device="cpu").learn(2000)
+    assert model.rollout.values.mean().item() == pytest.approx(5, abs=0.2)
+
+
+def exchange(model):
+    model.policy = type(model.policy)(model.observation_space, model.action_space, model.lr_schedule)
+    with th.no_grad():
+        model.policy.value_net.bias.fill_(100.0)
+
+
+def test_a_policy_that_a_callback_exchanges_is_valued_by_its_own_critic():
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=16, learning_rate=0.0, seed=0, device="cpu")
+    model.learn(16, callback=At(4, exchange))
+    assert (model.rollout.values > 90).all()
+
+
+def test_a_checkpoint_of_the_middle_of_a_rollout_can_be_measured(tmp_path):
+    model = make("steps", Corridor((3,)))
+    model.learn(16, callback=At(5, lambda model: model.save(tmp_path / "model")))
+    loaded = REINFORCE.load(tmp_path / "model", env=Corridor((3,)), device="cpu")
+    assert len(compare_baselines(loaded, n_episodes=4)) > 0
+
+
+def test_training_goes_on_after_a_measurement_that_failed_in_a_callback():
+    class Failing(Corridor):
+        fails = False
+
+        def step(self, action):
+            if self.fails:
+                raise OSError("the simulator has gone")
+            return super().step(action)
+
+    env = Failing((3,))
+
+    def measure(model):
+        env.fails = True
+        with pytest.raises(OSError, match="has gone"):
+            landscape(model, n_points=2, n_episodes=1)
+        env.fails = False
+
+    model = make("steps", env).learn(32, callback=Record(measure))
+    assert model._n_updates == 4 and np.isfinite(model.rollout_buffer.advantages).all()
