@@ -88,11 +88,14 @@ def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.M
     return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
 
 
-def distribution_of(policy: ActorCriticPolicy, outputs: th.Tensor) -> Distribution:
-    """The distribution of actions for logits or means of shape ``(n, width)``, for a plain actor."""
-    if isinstance(policy.action_dist, DiagGaussianDistribution):
-        return policy.action_dist.proba_distribution(outputs, policy.log_std)
-    return policy.action_dist.proba_distribution(outputs)
+def distribution_of(
+    policy: ActorCriticPolicy, outputs: th.Tensor, action_dist: Distribution | None = None
+) -> Distribution:
+    """The distribution of actions for logits or means of shape ``(n, width)``, by default of the policy's kind."""
+    kind = action_dist or policy.action_dist
+    if isinstance(kind, DiagGaussianDistribution):
+        return kind.proba_distribution(outputs, policy.log_std)
+    return kind.proba_distribution(outputs)
 
 
 def evaluate(

@@ -93,7 +93,7 @@ class NumpyActor:
     def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
         outputs = th.as_tensor(np.concatenate(self.outputs))
         rows = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
-        return distribution_of(self.policy, outputs).log_prob(rows).cpu().numpy()
+        return distribution_of(self.policy, outputs, self.distribution).log_prob(rows).cpu().numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         # A hook or a replaced method adds an entry to a dict; other parts and parameters are other objects
