@@ -231,4 +231,5 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
         # Box2D is not there, or warns where it is imported, and an error there would not be caught
         warnings.simplefilter("ignore")
         pytest.importorskip("Box2D")
-    assert healthy("LunarLander-v3", 150_000) == ({}, 0)
+    # With the default four passes and γ = 0.99 the critic of some seeds explains nothing for most of the run
+    assert healthy("LunarLander-v3", 150_000, gamma=0.999, n_critic_updates=10, batch_size=64) == ({}, 0)
