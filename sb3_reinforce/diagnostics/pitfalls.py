@@ -131,7 +131,7 @@ def uses_total_return(history: History) -> str | None:
 def spikes_without_clipping(history: History) -> str | None:
     """A gradient ten times as long as usual, without a bound on its norm."""
     norms = [update.grad_norm for update in history.updates]
-    if history.model.max_grad_norm is None and len(norms) >= 20 and norms[-1] > 10 * median(norms[:-1]) > 0:
+    if history.model.max_grad_norm in (None, math.inf) and len(norms) >= 20 and norms[-1] > 10 * median(norms[:-1]) > 0:
         return (
             f"A gradient has norm {norms[-1]:.3g}, and the median is {median(norms[:-1]):.3g}: one such batch can undo "
             "what was learned. Set max_grad_norm, 0.5 for example"

@@ -80,7 +80,7 @@ def check_hyperparams(algorithm: str, hyperparams: Settings, optimize: bool) -> 
 
 
 def as_dict(key: str, value: Any) -> Settings:
-    """A setting as a dict: the Zoo evaluates a text as Python, with the names of its own module."""
+    """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
     result = {} if value is None else value
     if isinstance(value, str) and key != "env_kwargs":
         try:
