@@ -197,6 +197,8 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
             operations.append(relu_in_place)
     hooks = temperature_hooks(layers[-1])
 
+    # As PyTorch, without warnings: some BLAS kernels read beyond the end of an array and flag what they find there
+    @np.errstate(all="ignore")
     def outputs(obs: np.ndarray) -> Floats:
         x: Floats = obs.reshape(n, -1).astype(np.float32, copy=False)
         for operation in operations:

@@ -77,3 +77,9 @@ def test_value_and_gradient_are_the_modules(layers):
     weights = th.randn(expected.shape)
     gradients, expected_gradients = (th.autograd.grad((weights * y).sum(), parameters) for y in (output, expected))
     th.testing.assert_close(gradients, expected_gradients)
+
+
+def test_numpy_never_warns_as_pytorch_does_not():
+    layer = nn.Linear(3, 2)
+    nn.init.constant_(layer.weight, th.finfo(th.float32).max)
+    assert np.isinf(numpy_forward([layer], 1)(np.ones((1, 3), dtype=np.float32))).all()
