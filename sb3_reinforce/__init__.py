@@ -4,8 +4,18 @@ from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 from sb3_reinforce.estimation import Rollout
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.linear import LinearPolicy
+from sb3_reinforce.policies.masks import ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.reinforce import REINFORCE
 
 __version__ = "0.1.0"
 
-__all__ = ["REINFORCE", "FiniteDifference", "GymnasiumVecEnv", "LinearPolicy", "Rollout", "__version__"]
+__all__ = [
+    "REINFORCE",
+    "ActionMaskObservation",
+    "FiniteDifference",
+    "GymnasiumVecEnv",
+    "LinearPolicy",
+    "MaskedPolicy",
+    "Rollout",
+    "__version__",
+]

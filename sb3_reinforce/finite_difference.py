@@ -37,6 +37,7 @@ from sb3_reinforce.estimation.perturbations import (
 )
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
+from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.sampling.utility import Stopped, episodic_utility
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
@@ -95,6 +96,7 @@ class FiniteDifference(BasePolicyGradient):
         "MlpPolicy": ActorCriticPolicy,
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
+        "MaskedPolicy": MaskedPolicy,
     }
     policy: ActorCriticPolicy
     _arguments = FINITE_DIFFERENCE_ARGUMENTS

@@ -37,6 +37,7 @@ from sb3_reinforce.policies.evaluation import (
     set_temperature,
     split_parameters,
 )
+from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
@@ -116,6 +117,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         "MlpPolicy": ActorCriticPolicy,
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
+        "MaskedPolicy": MaskedPolicy,
     }
     _arguments = REINFORCE_ARGUMENTS
     _own_argument = "reward_to_go"

@@ -36,9 +36,9 @@ MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
 STACK_FRAMES = "stack observations with VecFrameStack, or use RecurrentPPO of sb3-contrib"
-MASK_LOGITS = "mask the logits in a subclass of ActorCriticPolicy, or use MaskablePPO of sb3-contrib"
+MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
-CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK_LOGITS}
+CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK}
 ONE_STEP = "it takes one policy step per rollout, which max_grad_norm alone bounds"
 OPTIMIZER = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead
@@ -58,7 +58,7 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
         return
     names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
     for name in names & CONTRIB_POLICIES.keys():
-        raise ValueError(f"policy must be neither recurrent nor masked, got {name}: {CONTRIB_POLICIES[name]}")
+        raise ValueError(f"policy must not be one of sb3-contrib, got {name}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 

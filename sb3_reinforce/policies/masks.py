@@ -1,0 +1,251 @@
+"""
+Action masks as part of the observation: no algorithm, callback or VecEnv has to know of them.
+
+The mask stands behind the features, passes the layers of the actor by, and meets the logits at the end.
+"""
+
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+    NatureCNN,
+)
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+KEY = "action_mask"
+# The key of an observation that was no dict before the mask was added
+OBSERVATION = "observation"
+
+Part = TypeVar("Part")
+
+
+class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
+    """
+    Adds the mask of an environment's ``action_masks()`` to its observations, under the key ``"action_mask"``.
+
+    An observation that is no dict becomes ``{"observation": ..., "action_mask": ...}``. The mask is an int8 array of
+    shape ``(n,)``, 1 where an action is allowed: n is the number of actions for ``Discrete``, and for
+    ``MultiDiscrete`` the sum of the numbers of each dimension, one dimension after the other. This is the contract of
+    sb3-contrib's ``MaskablePPO``, so its environments and its ``ActionMasker`` can be wrapped as they are. Use it with
+    ``MaskedPolicy``. ``VecNormalize`` then needs ``norm_obs_keys``, since a mask cannot be normalized.
+
+    :param env: An environment with a method ``action_masks()`` that returns n booleans
+    :raises TypeError: If the environment has no such method
+    :raises ValueError: If actions are neither ``Discrete`` nor ``MultiDiscrete``, or observations already have a mask;
+        in ``reset`` and ``step``, if the mask does not have n entries, or allows nothing before the episode is over
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]):
+        super().__init__(env)
+        sizes = sizes_of(env.action_space)
+        if not env.has_wrapper_attr("action_masks"):
+            raise TypeError(f"env must have a method action_masks() that says which actions are allowed, got {env}")
+        space = env.observation_space
+        self._has_dicts = isinstance(space, spaces.Dict)
+        parts = space.spaces if isinstance(space, spaces.Dict) else {OBSERVATION: space}
+        if KEY in parts:
+            raise ValueError(f"The observations of env must not have the key {KEY!r} yet, got {space}")
+        self._n_actions = sum(sizes)
+        self._first_actions = np.cumsum([0, *sizes[:-1]])
+        self.observation_space = spaces.Dict({**parts, KEY: spaces.MultiBinary(self._n_actions)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
+        """
+        Reset the environment.
+
+        :param seed: As for ``gymnasium.Env``
+        :param options: As for ``gymnasium.Env``
+        :return: The first observation with its mask, and the info
+        """
+        obs, info = self.env.reset(seed=seed, options=options)
+        return self._with_mask(obs, is_over=False), info
+
+    def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+        """
+        Take an action.
+
+        :param action: The action
+        :return: The observation with its mask, reward, terminated, truncated, info
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._with_mask(obs, is_over=terminated or truncated), reward, terminated, truncated, info
+
+    def _with_mask(self, obs: Any, is_over: bool) -> dict[str, Any]:
+        """An observation with the mask of the present state."""
+        masks = self.env.get_wrapper_attr("action_masks")()
+        try:
+            mask = np.asarray(masks, dtype=bool).ravel()
+        except ValueError:
+            # Lists of different lengths
+            mask = np.empty(0, dtype=bool)
+        if len(mask) != self._n_actions:
+            raise ValueError(
+                f"action_masks() must return {self._n_actions} booleans in a row for {self.action_space}, got {masks!r}"
+            )
+        if not is_over and not np.logical_or.reduceat(mask, self._first_actions).all():
+            each = " in each dimension" if isinstance(self.action_space, spaces.MultiDiscrete) else ""
+            raise ValueError(
+                f"action_masks() must allow an action{each} of {self.action_space} until the episode is over, "
+                f"got {masks!r}"
+            )
+        parts = obs if self._has_dicts else {OBSERVATION: obs}
+        return {**parts, KEY: mask.astype(np.int8)}
+
+
+def sizes_of(action_space: spaces.Space[Any]) -> list[int]:
+    """The number of actions in each dimension of a space whose actions can be masked."""
+    if isinstance(action_space, spaces.Discrete):
+        return [int(action_space.n)]
+    if isinstance(action_space, spaces.MultiDiscrete):
+        return [int(n) for n in action_space.nvec.flat]
+    raise ValueError(f"action_space must be Discrete or MultiDiscrete for its actions to be masked, got {action_space}")
+
+
+def without_mask(parts: dict[str, Part]) -> Part | dict[str, Part]:
+    """What there was before ``ActionMaskObservation`` of the parts of an observation, or of their spaces."""
+    rest = {key: part for key, part in parts.items() if key != KEY}
+    return rest[OBSERVATION] if rest.keys() == {OBSERVATION} else rest
+
+
+def split_mask(features: th.Tensor, n_actions: int) -> tuple[th.Tensor, th.Tensor]:
+    """Features ``(..., n_features)`` and the mask ``(..., n_actions)`` that stands behind them."""
+    return features[..., :-n_actions], features[..., -n_actions:]
+
+
+def mask_logits(logits: th.Tensor, mask: th.Tensor, sizes: list[int]) -> th.Tensor:
+    """
+    ``logits(s, a)`` where a is allowed, else −∞; all are allowed in a dimension where none is.
+
+    In such a state, a terminal one or zeros that probe the policy, π would be NaN.
+    """
+    allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), sizes, dim=-1)]
+    return logits.masked_fill(~th.cat(allowed, dim=-1), -th.inf)
+
+
+class MaskedExtractor(BaseFeaturesExtractor):
+    """The features and the mask behind them, ``(n, features_dim + n_actions)``; ``features_dim`` sizes the layers."""
+
+    def __init__(self, space: spaces.Dict, extractor: BaseFeaturesExtractor):
+        super().__init__(space, extractor.features_dim)
+        self.extractor = extractor
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        features = self.extractor(without_mask(observations))
+        return th.cat([features, observations[KEY].to(features)], dim=1)
+
+
+class MaskedMlpExtractor(nn.Module):
+    """The latents of the actor with the mask behind them, and those of the critic without."""
+
+    def __init__(self, extractor: MlpExtractor, n_actions: int):
+        super().__init__()
+        self.extractor = extractor
+        self.n_actions = n_actions
+        self.latent_dim_pi = extractor.latent_dim_pi
+        self.latent_dim_vf = extractor.latent_dim_vf
+
+    def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: th.Tensor) -> th.Tensor:
+        features, mask = split_mask(features, self.n_actions)
+        return th.cat([self.extractor.forward_actor(features), mask], dim=-1)
+
+    def forward_critic(self, features: th.Tensor) -> th.Tensor:
+        return self.extractor.forward_critic(split_mask(features, self.n_actions)[0])
+
+
+class MaskedLogits(nn.Module):
+    """The logits of an action net, −∞ for forbidden actions."""
+
+    def __init__(self, action_net: nn.Module, sizes: list[int]):
+        super().__init__()
+        self.action_net = action_net
+        self.sizes = sizes
+
+    def forward(self, latent: th.Tensor) -> th.Tensor:
+        latent, mask = split_mask(latent, sum(self.sizes))
+        return mask_logits(self.action_net(latent), mask, self.sizes)
+
+
+class MaskedPolicy(ActorCriticPolicy):
+    """
+    An ``ActorCriticPolicy`` that takes no action which the observation forbids, for any algorithm that trains one.
+
+    π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
+    log π, its gradient and the entropy are those of that distribution. Where nothing is allowed, as in terminal states,
+    all actions are. The critic and the features do not see the mask.
+
+    :param observation_space: A ``Dict`` with the key ``"action_mask"`` and at least one more
+    :param action_space: ``Discrete`` or ``MultiDiscrete``
+    :param lr_schedule: Learning rate schedule
+    :param features_extractor_class: Extracts the features of the observation without the mask: of the array under
+        ``"observation"`` if nothing else is there, else of the dict. None for the extractor of MlpPolicy, CnnPolicy or
+        MultiInputPolicy, whichever fits
+    :param kwargs: As for ``ActorCriticPolicy``
+    :raises ValueError: If the spaces are others
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        **kwargs: Any,
+    ):
+        n_actions = sum(sizes_of(action_space))
+        parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {}
+        if parts.get(KEY) != spaces.MultiBinary(n_actions) or len(parts) == 1:
+            raise ValueError(
+                f"observation_space must be a Dict of observations and {KEY!r}: MultiBinary({n_actions}) with "
+                f"MaskedPolicy (wrap the environment in ActionMaskObservation), got {observation_space}"
+            )
+        if features_extractor_class is None:
+            features_extractor_class = extractor_class_for(without_mask(parts))
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            features_extractor_class=features_extractor_class,
+            **kwargs,
+        )
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """
+        Make a features extractor that leaves the mask alone.
+
+        :return: The features extractor
+        """
+        space: Any = self.observation_space
+        rest = without_mask(space.spaces)
+        inner = self.features_extractor_class(
+            spaces.Dict(rest) if isinstance(rest, dict) else rest, **self.features_extractor_kwargs
+        )
+        return MaskedExtractor(space, inner)
+
+    def _build_mlp_extractor(self) -> None:
+        super()._build_mlp_extractor()
+        n_actions = sum(sizes_of(self.action_space))
+        self.mlp_extractor = MaskedMlpExtractor(self.mlp_extractor, n_actions)  # type: ignore[assignment]
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.action_net = MaskedLogits(self.action_net, sizes_of(self.action_space))
+
+
+def extractor_class_for(space: spaces.Space[Any] | dict[str, spaces.Space[Any]]) -> type[BaseFeaturesExtractor]:
+    """The features extractor that Stable-Baselines3's policies use by default."""
+    if isinstance(space, dict):
+        return CombinedExtractor
+    return NatureCNN if is_image_space(space) else FlattenExtractor
