@@ -60,23 +60,12 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
         self.observation_space = spaces.Dict({**parts, KEY: spaces.MultiBinary(self._n_actions)})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
-        """
-        Reset the environment.
-
-        :param seed: As for ``gymnasium.Env``
-        :param options: As for ``gymnasium.Env``
-        :return: The first observation with its mask, and the info
-        """
+        """As ``gymnasium.Env.reset``, with the mask in the observation."""
         obs, info = self.env.reset(seed=seed, options=options)
         return self._with_mask(obs, is_over=False), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
-        """
-        Take an action.
-
-        :param action: The action
-        :return: The observation with its mask, reward, terminated, truncated, info
-        """
+        """As ``gymnasium.Env.step``, with the mask in the observation."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._with_mask(obs, is_over=terminated or truncated), reward, terminated, truncated, info
 
