@@ -36,8 +36,10 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     An observation that is no dict becomes ``{"observation": ..., "action_mask": ...}``. The mask is an int8 array of
     shape ``(n,)``, 1 where an action is allowed: n is the number of actions for ``Discrete``, and for
     ``MultiDiscrete`` the sum of the numbers of each dimension, one dimension after the other. This is the contract of
-    sb3-contrib's ``MaskablePPO``, so its environments and its ``ActionMasker`` can be wrapped as they are. Use it with
-    ``MaskedPolicy``. ``VecNormalize`` then needs ``norm_obs_keys``, since a mask cannot be normalized.
+    sb3-contrib's ``MaskablePPO``, so its environments and its ``ActionMasker`` can be wrapped as they are.
+
+    ``MaskedPolicy`` obeys the mask; other policies take it for a feature. ``VecNormalize`` needs ``norm_obs_keys``,
+    since a mask cannot be normalized, and frames are stacked below this wrapper, not by ``VecFrameStack``.
 
     :param env: An environment with a method ``action_masks()`` that returns n booleans
     :raises TypeError: If the environment has no such method
@@ -112,11 +114,8 @@ def split_mask(features: th.Tensor, n_actions: int) -> tuple[th.Tensor, th.Tenso
 
 
 def mask_logits(logits: th.Tensor, mask: th.Tensor, sizes: list[int]) -> th.Tensor:
-    """
-    ``logits(s, a)`` where a is allowed, else −∞; all are allowed in a dimension where none is.
-
-    In such a state, a terminal one or zeros that probe the policy, π would be NaN.
-    """
+    """``logits(s, a)`` where a is allowed, else −∞; in a dimension where nothing is allowed, all is."""
+    # Else π would be NaN in terminal states, and for the zeros by which a policy is probed
     allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), sizes, dim=-1)]
     return logits.masked_fill(~th.cat(allowed, dim=-1), -th.inf)
 
