@@ -10,7 +10,7 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from sb3_reinforce.common.arguments import check_function, check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, stack, to_vector
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, some
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, spread
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
@@ -116,8 +116,8 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     obs = select(rollout.observations, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
     return {
-        "log_prob": log_prob_error(policy, some(obs, actions)[0]),
-        "scores": score_error(policy, *some(obs, actions)),
+        "log_prob": log_prob_error(policy, spread(obs, actions)[0]),
+        "scores": score_error(policy, *spread(obs, actions)),
         "sign": sign_error(policy, obs),
         "returns": return_error(collector, rollout, infos),
         "weights": weight_error(collector, rollout),

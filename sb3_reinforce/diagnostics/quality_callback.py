@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks
-from sb3_reinforce.diagnostics.sampling import check_independent, check_model, training_weights
+from sb3_reinforce.diagnostics.sampling import check_model, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
@@ -70,8 +70,7 @@ class GradientQualityCallback(BaseCallback):
             self.thetas: list[th.Tensor] = []
         if isinstance(self.model, FiniteDifference):
             return
-        check_model(self.model)
-        check_independent(self.model)
+        check_model(self.model, independent=True)
         self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
 
     def _on_step(self) -> bool:
