@@ -15,7 +15,7 @@ from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.configuration import ConfigurationError, closest
+from sb3_reinforce.zoo.experiments import ConfigurationError, closest
 
 FUNCTIONS = {
     "train": "rl_zoo3.train",
