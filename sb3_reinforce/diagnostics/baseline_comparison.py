@@ -120,14 +120,14 @@ def baseline_rows(
     rollout: Rollout, functions: dict[str, Baseline], reference: str, counts: th.Tensor, confidence: float
 ) -> list[BaselineRow]:
     """The rows of ``compare_baselines`` from whole episodes, with ``counts`` (r, m) of their resamples."""
-    values = {}
+    weights = {}
     seconds = {"floor": float("nan")}
     for name, function in functions.items():
         if function is not BASELINES["optimal"]:
             begin = time.perf_counter()
-            values[name] = th.as_tensor(check_baseline(function(rollout), rollout))
+            weights[name] = weights_by(function, rollout)
             seconds[name] = time.perf_counter() - begin
-    grams, seconds["optimal"] = gram_matrices(rollout, values)
+    grams, seconds["optimal"] = gram_matrices(rollout, weights)
     moments = {name: compute_moments(grams[name], counts) for name in (*functions, "floor")}
     return [
         BaselineRow(
@@ -140,6 +140,11 @@ def baseline_rows(
         )
         for name, of in moments.items()
     ]
+
+
+def weights_by(baseline: Baseline, rollout: Rollout) -> th.Tensor:
+    """``γ^t (G_t − b_t)`` with a baseline, shape ``(n_steps, n_envs)``, float64."""
+    return rollout.discounts * (rollout.returns - th.as_tensor(check_baseline(baseline(rollout), rollout)))
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
@@ -155,16 +160,14 @@ def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
     return 1 / len(lengths) if own_return_in_mean else float("nan")
 
 
-def gram_matrices(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
+def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
     """
-    ``K_ij = ⟨g_i, g_j⟩`` (m, m) by baseline b_t (n_steps, n_envs), ``"none"`` first, for ``"optimal"`` and for the
-    ``"floor"``; and the seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
+    ``K_ij = ⟨g_i, g_j⟩`` (m, m) for weights (n_steps, n_envs) by baseline, ``"none"`` first, for ``"optimal"`` and for
+    the ``"floor"``; and the seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
 
-    Every baseline is one more weight in the same pass. The optimal one, b, leaves A − b S, so that its K follows from
-    the products of A and S.
+    The optimal baseline b leaves A − b S, so that its K follows from the products of A and S.
     """
     n_episodes = len(th.unique(rollout.episodes[rollout.used]))
-    weights = {name: rollout.discounts * (rollout.returns - baseline) for name, baseline in baselines.items()}
     found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in (*weights, "A S", "S S", "floor")}
     seconds = 0.0
     begin = time.perf_counter()

@@ -14,8 +14,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
+from sb3_reinforce.policies.plain_mlp import temperature_hooks
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -182,6 +184,21 @@ def randomness(space: spaces.Space[Any], update: Update) -> float:
     else:
         largest = math.log(2) * math.prod(space.shape or ())
     return update.entropy / largest if largest > 0 else float("nan")
+
+
+def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
+    """The mean standard deviation of a Gaussian policy's actions, which with gSDE ``train/std`` is not; else NaN."""
+    if not isinstance(policy.action_space, spaces.Box):
+        return math.nan
+    distribution = policy.get_distribution(obs).distribution
+    return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
+
+
+def temperature_of(policy: ActorCriticPolicy) -> float:
+    """The temperature at which a policy acts."""
+    layer = getattr(policy, "action_net", None)
+    hooks = temperature_hooks(layer) if layer is not None else []
+    return float(hooks[0].temperature) if hooks else 1.0
 
 
 def cut_episodes(history: History) -> str | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, cast
 
 import torch as th
@@ -97,3 +98,12 @@ def training_weights(model: REINFORCE) -> th.Tensor:
     weights = th.zeros_like(rollout.returns)
     weights[rollout.used] = compute_weights(rollout, advantages, model.normalize_advantage).to(weights)
     return weights
+
+
+def evenly_spread(rollout: Rollout, n_episodes: int) -> Rollout:
+    """A rollout of which only ``n_episodes`` episodes are used, spread evenly over the environments."""
+    numbers = th.unique(rollout.episodes[rollout.used])
+    if len(numbers) <= n_episodes:
+        return rollout
+    kept = numbers[th.linspace(0, len(numbers) - 1, n_episodes).round().long()]
+    return replace(rollout, used=rollout.used & th.isin(rollout.episodes, kept))

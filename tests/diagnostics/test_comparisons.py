@@ -170,7 +170,7 @@ def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeyp
     env = make_vec_env("CartPole-v1", 3, seed=1)
     model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": [5]}, seed=1, device="cpu")
     rollout = sample(model, 6)
-    baselines = {name: function(rollout) for name, function in BASELINES.items() if name != "optimal"}
+    weights = {name: rollout.returns - each(rollout) for name, each in BASELINES.items() if name != "optimal"}
     sizes = []
 
     def blocks(*args):
@@ -179,7 +179,7 @@ def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeyp
             yield block
 
     monkeypatch.setattr(baseline_comparison, "gradient_blocks", blocks)
-    found, _ = baseline_comparison.gram_matrices(rollout, baselines)
+    found, _ = baseline_comparison.gram_matrices(rollout, weights)
     assert max(sizes) <= max(floats, 6 * 6)
     for name, function in BASELINES.items():
         gradients = gradients_by_episode(rollout, rollout.returns - function(rollout))[0].double()

@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import GradientQualityCallback, gradients_by_episode
-from sb3_reinforce.diagnostics.quality_callback import evenly_spread
+from sb3_reinforce.diagnostics.sampling import evenly_spread
 from sb3_reinforce.estimation.baselines import BASELINES
 
 
