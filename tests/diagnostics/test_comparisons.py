@@ -51,16 +51,6 @@ def bandit(better=0.5, **kwargs):
     return model
 
 
-def called(name, value=0.5):
-    """A constant baseline of that name."""
-
-    def function(rollout):
-        return th.full_like(rollout.returns, value)
-
-    function.__name__ = name
-    return function
-
-
 def exact_moments(better):
     """
     ``E‖s‖²``, ``E‖s (r − b)‖²`` as a function of b, and ``‖E g‖²``.
@@ -135,14 +125,6 @@ def test_batches_of_twenty_have_their_known_variances(better):
         assert found.low < truth < found.high
 
 
-def test_no_constant_can_pass_the_floor():
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 4, seed=0), seed=0, device="cpu")
-    constants = [called(f"constant {b}", b) for b in (-5.0, 1.0, 10.0, 20.0, 40.0)]
-    table = compare_baselines(model, 30, [*constants, "mean"])
-    assert len(table) == 8
-    assert all(table["floor"].variance.value <= row.variance.value for row in table)
-
-
 def test_the_floor_is_the_best_constant_of_each_component():
     weighted, scores = th.randn(40, 3).double(), th.randn(40, 3).double()
     residual = componentwise_residuals(weighted, scores).var(0)
@@ -152,25 +134,10 @@ def test_the_floor_is_the_best_constant_of_each_component():
         assert residual[k] <= min(tried)
 
 
-def test_rows_are_the_variances_of_the_gradients_themselves():
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 3, seed=1), seed=1, device="cpu")
-    model.env.seed(7)
-    table = compare_baselines(model, 12, seed=5)
-    th.manual_seed(5)
-    model.env.seed(7)
-    rollout = sample(model, 12)
-    for name, baseline in BASELINES.items():
-        weights = rollout.discounts * (rollout.returns - baseline(rollout))
-        gradients = gradients_by_episode(rollout, weights)[0].double()
-        assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
-
-
 @pytest.mark.parametrize("floats", [1, 5000, 2**26])
-def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeypatch, floats):
+def test_rows_are_the_variances_of_the_gradients_however_much_of_these_is_held(monkeypatch, floats):
     env = make_vec_env("CartPole-v1", 3, seed=1)
     model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": [5]}, seed=1, device="cpu")
-    rollout = sample(model, 6)
-    weights = {name: rollout.returns - each(rollout) for name, each in BASELINES.items() if name != "optimal"}
     sizes = []
 
     def blocks(*args):
@@ -179,11 +146,20 @@ def test_the_products_do_not_depend_on_how_much_of_the_gradients_is_held(monkeyp
             yield block
 
     monkeypatch.setattr(baseline_comparison, "gradient_blocks", blocks)
-    found, _ = baseline_comparison.gram_matrices(rollout, weights)
+    model.env.seed(7)
+    table = compare_baselines(model, 6, seed=5)
+    # Six weights of six episodes
     assert max(sizes) <= max(floats, 6 * 6)
-    for name, function in BASELINES.items():
-        gradients = gradients_by_episode(rollout, rollout.returns - function(rollout))[0].double()
-        th.testing.assert_close(found[name], gradients @ gradients.T, rtol=1e-4, atol=1e-4 * float(found[name].max()))
+    th.manual_seed(5)
+    model.env.seed(7)
+    rollout = sample(model, 6)
+    for name, baseline in BASELINES.items():
+        weights = rollout.discounts * (rollout.returns - baseline(rollout))
+        gradients = gradients_by_episode(rollout, weights)[0].double()
+        assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
+    weighted, scores = gradients_by_episode(rollout, rollout.discounts * rollout.returns, rollout.discounts).double()
+    floor = float(componentwise_residuals(weighted, scores).var(0).sum())
+    assert table["floor"].variance.value == pytest.approx(floor, rel=1e-4)
 
 
 def test_time_or_state_halve_the_variance_on_cartpole():
@@ -203,7 +179,10 @@ def test_bias_is_told_where_theory_knows_it():
 
 
 def test_a_users_function_is_a_row_and_the_table_prints():
-    table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10, called("half"))
+    def half(rollout):
+        return th.full_like(rollout.returns, 0.5)
+
+    table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10, half)
     assert table.names == ["none", "half", "floor"]
     assert set(table.legend) == {*table.columns[1:], "[a, b]"}
     assert all(text in str(table) for text in table.legend.values())
@@ -222,29 +201,6 @@ def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pandas"):
         table.to_pandas()
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"n_episodes": 2}, "n_episodes must be at least 3, got 2"),
-        ({"n_episodes": 10.0}, "n_episodes must be an integer"),
-        ({"baselines": ("no_such_baseline",)}, r"baselines must be.*'time_mean'.*got 'no_such_baseline'"),
-        ({"baselines": 3}, "baselines must be a name or a callable, got 3"),
-        ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "two of its functions are named '<lambda>'"),
-        ({"baselines": called("none")}, "named 'none'"),
-        ({"baselines": called("floor")}, "a function named 'floor', which is the name of a row"),
-        ({"baselines": called("optimal")}, "a function named 'optimal', which is the name of a row"),
-        ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
-        ({"baselines": ("value",)}, "no critic.*'none'"),
-        ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
-        ({"n_resamples": 0}, "n_resamples"),
-        ({"confidence": 2.0}, "confidence"),
-    ],
-)
-def test_a_users_mistake_is_named(kwargs, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        compare_baselines(REINFORCE("MlpPolicy", Tree(), baseline="none", device="cpu"), **kwargs)
 
 
 def test_with_new_noise_at_each_step_they_are():
