@@ -102,12 +102,14 @@ def compare_estimators(
         reference = likelihood_ratio(model, n_episodes)[0]
         for name in names:
             begin = time.perf_counter()
+            n_steps_before = utility.n_steps
             if name == LIKELIHOOD_RATIO:
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
                 k = default_n_delta(name, n_parameters) if n_delta is None else n_delta
                 deltas = (scale * draw(k, n_parameters, generator) for _ in range(n_estimates))
-                gradients, n_steps = finite_differences(utility, name, deltas)
+                gradients = th.stack([ESTIMATORS[name](utility, utility.theta, each) for each in deltas])
+                n_steps = utility.n_steps - n_steps_before
             seconds = (time.perf_counter() - begin) / len(gradients)
             steps = n_steps / len(gradients)
             to_reference, snr = judge(gradients, reference, n_resamples, confidence, seed)
@@ -134,13 +136,6 @@ def judge(
     products = (counts @ gram(gradients, reference) * others).sum(1) / (counts.sum(1) * others.sum(1))
     to_reference = cosine(moments, compute_moments(gram(reference), others), products, confidence)
     return to_reference, interval(signal_to_noise(moments), confidence)
-
-
-def finite_differences(utility: CandidateUtility, name: str, deltas: Iterable[th.Tensor]) -> tuple[th.Tensor, int]:
-    """One gradient for each of m perturbations ``(k, n)``, shape ``(m, n)``, and the environment steps of all."""
-    before = utility.n_steps
-    gradients = [ESTIMATORS[name](utility, utility.theta, each) for each in deltas]
-    return th.stack(gradients), utility.n_steps - before
 
 
 def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:

@@ -143,8 +143,7 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
 
 def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
     """The largest difference between a return and its definition, relative to the largest return."""
-    error = 0.0
-    scale = 1e-12
+    expected = th.zeros_like(rollout.returns)
     for episode in th.unique(rollout.episodes[rollout.used]):
         steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
         values = np.zeros(len(steps))
@@ -156,12 +155,10 @@ def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
                 with th.no_grad():
                     values[-1] = float(rollout.policy.predict_values(terminal))
         rewards = rollout.rewards[steps, envs].numpy()
-        expected = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
-        if not collector.reward_to_go:
-            expected[:] = expected[0]
-        error = max(error, float(np.abs(rollout.returns[steps, envs].numpy() - expected).max()))
-        scale = max(scale, float(np.abs(expected).max()))
-    return error / scale
+        returns = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
+        expected[steps, envs] = th.as_tensor(returns if collector.reward_to_go else np.full_like(returns, returns[0]))
+    differences = (rollout.returns - expected)[rollout.used]
+    return float(differences.abs().max() / expected.abs().max().clamp(min=1e-12))
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:

@@ -38,11 +38,6 @@ class Update:
     used_fraction: float  # share of the steps that were used
     temperature: float = 1.0  # of the rollout
 
-    @property
-    def has_returns_to_explain(self) -> bool:
-        """Whether there is a critic, and returns vary by a tenth of their size: a pole that never falls has none."""
-        return math.isfinite(self.explained_variance) and self.return_std > 0.1 * self.return_scale
-
 
 @dataclass(frozen=True)
 class History:
@@ -143,7 +138,9 @@ def spikes_without_clipping(history: History) -> str | None:
 
 def useless_critic(history: History) -> str | None:
     """Values that explain none of the variance of the returns, after 100 updates and half of the training."""
-    explained = [update.explained_variance for update in history.updates if update.has_returns_to_explain]
+    # Returns that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
+    varied = [update for update in history.updates if update.return_std > 0.1 * update.return_scale]
+    explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]
     late = history.n_updates >= 100 and history.progress_remaining < 0.5
     if history.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
         return (
