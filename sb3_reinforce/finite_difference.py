@@ -24,8 +24,7 @@ from sb3_reinforce.estimation.estimators import (
     Estimator,
     GradientEstimate,
     central_difference,
-    check_deltas,
-    check_estimate,
+    check_tensor,
     fit_quality,
 )
 from sb3_reinforce.estimation.perturbations import (
@@ -272,14 +271,14 @@ class FiniteDifference(BasePolicyGradient):
             generator = cast(th.Generator, self._generator)
             delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
             directions = self._function("perturbation", PERTURBATIONS)(n_delta, n, generator)
-            deltas = delta_std * check_deltas(directions, n_delta, n)
+            deltas = delta_std * check_tensor("perturbation", directions, (n_delta, n))
             estimator = self._function("estimator", ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
             with episodic_utility(self, searched, callback, first_seed) as utility:
-                gradient = check_estimate(estimator(utility, theta, deltas), n)
+                gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:

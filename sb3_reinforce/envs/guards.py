@@ -9,10 +9,9 @@ statistics take them in. What a subclass of ``DummyVecEnv`` returns is not check
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -21,18 +20,14 @@ from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
 from sb3_reinforce.envs.workers import watch
 
-Model = TypeVar("Model", bound=BaseAlgorithm)
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 
-def guarded(
-    learn: Callable[Concatenate[Model, Arguments], Result],
-) -> Callable[Concatenate[Model, Arguments], Result]:
+def guarded(learn: Learn) -> Learn:
     """``learn`` with its model's environments guarded, and with SIGTERM ending it as Ctrl-C does."""
 
     @wraps(learn)
-    def run(model: Model, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:
         with interruptible(), guard(model.env):
             try:
                 return learn(model, *args, **kwargs)
@@ -42,7 +37,7 @@ def guarded(
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
 
-    return run
+    return cast(Learn, run)
 
 
 @contextmanager

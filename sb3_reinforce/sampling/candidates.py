@@ -17,11 +17,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_reinforce.envs.checks import all_finite, format_number, is_finite
+from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
-UNCHANGED = "The policy is the one before this update."
 
 
 # Not frozen: one is made at each step, which would take three times as long
@@ -51,29 +50,16 @@ class EpisodeTracker:
 
     def add(self, rewards: np.ndarray, obs: Any) -> None:
         """Add a step, after checking that its numbers are finite and that no episode is longer than allowed."""
+        check_finite("The reward", rewards, (None,))
+        check_finite("The observation", obs, (None,))
         self.totals += rewards
-        self.check("The reward", rewards)
-        self.check("The observation", obs)
         self.clock += 1
         if self.clock > self.deadline:
-            late = int(np.argmax(self.active & (self.started_at + self.max_episode_steps == self.deadline)))
+            env = int(np.argmax(self.active & (self.started_at + self.max_episode_steps == self.deadline)))
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps "
-                f"({self.describe(late)}): give the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
+                f"An episode in environment {env} has not ended after max_episode_steps={self.max_episode_steps} "
+                "steps: give it a time limit, or raise max_episode_steps. The policy is the one before this update."
             )
-
-    def check(self, name: str, values: Any) -> None:
-        """Check that numbers of shape ``(n_envs, ...)``, or dicts of them, are finite where a candidate acts."""
-        if isinstance(values, dict):
-            for key, part in values.items():
-                self.check(f"{name} {key!r}", part)
-            return
-        if all_finite(values):
-            return
-        bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
-        if bad.any():
-            env = int(bad.argmax())
-            raise ValueError(f"{name} of {self.describe(env)} is not finite: {format_number(values[env])}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """Write the finished episodes to ``returns[candidate, episode]``, and list the environments with new pairs."""
@@ -90,11 +76,6 @@ class EpisodeTracker:
                 self.active[env] = False
         self.deadline = self.max_episode_steps + int(self.started_at[self.active].min(initial=self.clock))
         return restarted
-
-    def describe(self, env: int) -> str:
-        """Where an environment is, for a message."""
-        candidate, episode = self.pairs[env]
-        return f"candidate {candidate}, episode {episode}, step {self.clock - self.started_at[env]} (environment {env})"
 
 
 def evaluate_candidates(
@@ -116,7 +97,7 @@ def evaluate_candidates(
     for queue in schedule_episodes(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
         tracker = EpisodeTracker(queue, env.num_envs, max_episode_steps)
         obs = start_episodes(env, tracker.pairs, seeds)
-        tracker.check("The observation", obs)
+        check_finite("The observation", obs, (None,))
         started = list(range(len(tracker.pairs)))
         # any() costs several times as much on a few numbers
         while np.count_nonzero(tracker.active):

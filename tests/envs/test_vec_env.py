@@ -230,11 +230,16 @@ def test_other_forms_of_observations_are_accepted(form):
     assert make("steps", env).learn(100).num_timesteps >= 100
 
 
-@both_modes
-def test_episodes_that_gymnasium_records(mode):
+def test_episodes_that_gymnasium_records():
     """Also where one ends while another goes on."""
-    vector_env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode)
-    env = GymnasiumVecEnv(RecordEpisodeStatistics(vector_env))
+    modes = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+    recorders = [
+        RecordEpisodeStatistics(SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode))
+        for mode in modes
+    ]
+    with pytest.raises(ValueError, match="use VecMonitor"):
+        GymnasiumVecEnv(recorders[1])
+    env = GymnasiumVecEnv(recorders[0])
     env.seed(0)
     env.reset()
     lengths, recorded = np.zeros(N_ENVS, dtype=int), []
