@@ -1,9 +1,8 @@
 """
 Guards of the environments while a model learns: a fault is named where it enters, before it does harm.
 
-``step_wait`` and ``reset`` are replaced on the instances: of the innermost ``DummyVecEnv``, to check the form of what
-its environments return, and of what lies right below each ``VecNormalize``, to check that numbers are finite before its
-statistics take them in. What a subclass of ``DummyVecEnv`` returns is not checked for its form.
+``step_wait`` and ``reset`` are replaced on two instances: the innermost ``DummyVecEnv``, but no subclass, to check the
+form of observations; and what lies right below each ``VecNormalize``, to check that numbers are finite.
 """
 
 from collections.abc import Callable, Iterator

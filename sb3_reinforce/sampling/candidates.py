@@ -1,12 +1,9 @@
 """
 Many parameter vectors evaluated side by side in one VecEnv.
 
-The queue of (candidate, episode) pairs is fixed before the first step, so that candidates with short episodes are not
-sampled more often than others. There are two ways to work it off:
-
-- With seeds, in rounds: as many pairs as there are environments start together, each from the seed of its episode. A
-  VecEnv resets an environment as soon as its episode ends, without a seed, so the others wait for the longest episode.
-- Without seeds, in one go: an environment whose episode ends takes the next pair of the queue.
+The queue of (candidate, episode) pairs is fixed before the first step, or short episodes would be sampled more often.
+With seeds it is worked off in rounds, whose pairs start together from the seeds of their episodes: a VecEnv resets an
+environment without a seed. Without seeds an environment whose episode ends takes the next pair.
 """
 
 from collections.abc import Callable
@@ -121,12 +118,9 @@ def schedule_episodes(n_candidates: int, n_episodes: int, n_envs: int, in_rounds
 
 
 def start_episodes(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> Any:
-    """
-    The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``.
-
-    ``VecEnv.seed(s)`` can only give environment i the seed s + i. So each environment is seeded by a reset through
-    ``env_method``, and the reset of all that follows, which goes through every wrapper, continues its random numbers.
-    """
+    """The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``."""
+    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
+    # all that follows, which goes through every wrapper, continues its random numbers
     if seeds is not None:
         envs_with: dict[int, list[int]] = {}
         for i, pair in enumerate(pairs):
