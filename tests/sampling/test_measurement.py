@@ -2,11 +2,9 @@
 
 import os
 import signal
-from typing import Any
 
 import numpy as np
 import pytest
-import torch as th
 from models import KINDS, Scaled, make, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback
@@ -17,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce.diagnostics import compare_estimators, landscape
 from sb3_reinforce.sampling.measurement import undisturbed
 
-MEASUREMENTS: dict[str, Any] = {
+MEASUREMENTS = {
     "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
     "compare_estimators": lambda model: compare_estimators(
         model, n_episodes=3, n_estimates=3, n_delta=2, n_resamples=5, estimators=("central", "likelihood_ratio")
@@ -25,14 +23,14 @@ MEASUREMENTS: dict[str, Any] = {
 }
 
 
-def observation(env: VecNormalize) -> np.ndarray:
+def observation(env):
     """What the environments show now."""
     return np.array([single.unwrapped.state for single in env.unwrapped.envs])
 
 
 @pytest.mark.parametrize("measure", MEASUREMENTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind: str, measure: str) -> None:
+def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind, measure):
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     model = make(kind, env, policy_kwargs={"features_extractor_class": Scaled}).learn(20)
     before, count = plain(model.policy.state_dict()), env.obs_rms.count
@@ -45,7 +43,7 @@ def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: type[BaseException]) -> None:
+def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error):
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     model = make("steps", env).learn(20)
     with pytest.raises(error), undisturbed(model):
@@ -54,10 +52,10 @@ def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: typ
     assert env.training
 
     class First(BaseCallback):
-        def _on_step(self) -> bool:
+        def _on_step(self):
             return False
 
-        def _on_rollout_start(self) -> None:
+        def _on_rollout_start(self):
             assert np.allclose(self.model._last_obs, env.normalize_obs(observation(env)), atol=1e-5)
             assert self.model._last_episode_starts.all()
 
@@ -67,12 +65,12 @@ def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: typ
 class Interrupted(ActorCriticPolicy):
     """Ctrl-C comes in the middle of a candidate's action."""
 
-    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+    def _predict(self, observation, deterministic=False):
         os.kill(os.getpid(), signal.SIGINT)
         return super()._predict(observation, deterministic)
 
 
-def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
+def test_ctrl_c_leaves_no_candidate_in_the_policy():
     model = A2C(Interrupted, "CartPole-v1", device="cpu")
     before = plain(model.policy.state_dict())
     with pytest.raises(KeyboardInterrupt):
@@ -81,20 +79,20 @@ def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind: str) -> None:
+def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind):
     class Measure(BaseCallback):
         n_made = 0
 
-        def _on_rollout_start(self) -> None:
+        def _on_rollout_start(self):
             with undisturbed(self.model):
                 self.n_made += 1
 
-        def _on_step(self) -> bool:
+        def _on_step(self):
             with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
                 self._on_rollout_start()
             return True
 
-        def _on_rollout_end(self) -> None:
+        def _on_rollout_end(self):
             self._on_rollout_start()
 
     callback = Measure()
