@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -16,6 +17,8 @@ KINDS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any]]] = {
     "episodes": (REINFORCE, {"n_episodes": 2, "baseline": "none"}),
     "search": (FiniteDifference, {"n_delta": 2, "estimator": "central", "common_random_numbers": False}),
 }
+all_kinds = pytest.mark.parametrize("kind", KINDS)
+both = pytest.mark.parametrize("kind", ["steps", "search"])
 
 
 def make(kind: str, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:

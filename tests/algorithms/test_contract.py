@@ -13,7 +13,7 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, make, moved_by_learning, plain
+from models import KINDS, all_kinds, make, moved_by_learning, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import (
@@ -35,7 +35,6 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
-all_kinds = pytest.mark.parametrize("kind", KINDS)
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
 
 FLAT = spaces.Box(-1, 1, (3,))
@@ -313,7 +312,7 @@ def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(space, 
     assert moved_by_learning(model, 20) == {name for name in names if "value_net" in name}
 
 
-@both_modes
+@all_kinds
 def test_a_policy_that_is_replaced_or_frozen_after_construction(kind):
     """As in A2C: what is trained is read from the policy at each step."""
     model, other = make(kind), make(kind)

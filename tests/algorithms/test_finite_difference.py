@@ -152,20 +152,6 @@ def test_a_features_extractor_of_the_user_is_searched_and_left_as_it_was():
     assert model.n_parameters == n_parameters - 1
 
 
-def test_what_is_searched_is_what_is_trainable_when_an_update_begins():
-    model = make(Line(), "MlpPolicy")
-    n_parameters = model.n_parameters
-    model.policy.action_net.requires_grad_(False)
-    head = plain(model.policy.action_net.state_dict())
-    model.learn(12)
-    assert plain(model.policy.action_net.state_dict()) == head and model.n_parameters == n_parameters - 65
-    old, model.policy = model.policy, make(Line(), "MlpPolicy", seed=1).policy
-    states = [plain(policy.state_dict()) for policy in (old, model.policy)]
-    model.learn(12)
-    assert plain(old.state_dict()) == states[0] and plain(model.policy.state_dict()) != states[1]
-    assert model.n_parameters == n_parameters
-
-
 def test_what_a_callback_freezes_is_searched_for_the_last_time():
     model = make(Line(), "MlpPolicy")
     hidden = [plain(model.policy.mlp_extractor.state_dict())]

@@ -8,9 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from callbacks import At
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, make
+from models import KINDS, both, make
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,7 +23,6 @@ from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARG
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
-both = pytest.mark.parametrize("kind", ["steps", "search"])
 
 NO_NUMBERS = ["x", True, [1], 1j, None]
 WRONG = {
@@ -212,14 +212,8 @@ def test_a_schedule_is_called_once_where_its_value_is_needed_once():
 @both
 def test_a_callback_may_replace_a_schedule(kind):
     name = "ent_coef" if kind == "steps" else "delta_std"
-
-    class Replace(BaseCallback):
-        def _on_step(self):
-            setattr(self.model, name, "x")
-            return True
-
     with pytest.raises(TypeError, match=f"{name} must be a number or a schedule"):
-        make(kind, **{name: 0.1}).learn(1000, Replace())
+        make(kind, **{name: 0.1}).learn(1000, At(1, lambda model: setattr(model, name, "x")))
 
 
 @both

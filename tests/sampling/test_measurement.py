@@ -5,9 +5,9 @@ import signal
 
 import numpy as np
 import pytest
-from models import KINDS, Scaled, make, plain
+from callbacks import Record
+from models import Scaled, all_kinds, make, plain
 from stable_baselines3 import A2C
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
@@ -29,7 +29,7 @@ def observation(env):
 
 
 @pytest.mark.parametrize("measure", MEASUREMENTS)
-@pytest.mark.parametrize("kind", KINDS)
+@all_kinds
 def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind, measure):
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     model = make(kind, env, policy_kwargs={"features_extractor_class": Scaled}).learn(20)
@@ -43,23 +43,21 @@ def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error):
-    env = VecNormalize(make_vec_env("CartPole-v1", 2))
-    model = make("steps", env).learn(20)
-    with pytest.raises(error), undisturbed(model):
-        env.step(np.zeros(2, dtype=int))
-        raise error
-    assert env.training
+def test_whatever_ends_a_measurement_the_next_rollout_begins_with_a_reset(error):
+    """In the middle of training too, where a callback measures."""
+    env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_obs=False)
 
-    class First(BaseCallback):
-        def _on_step(self):
-            return False
+    def fail(model):
+        with pytest.raises(error), undisturbed(model):
+            env.step(np.zeros(2, dtype=int))
+            raise error
+        assert env.training
+        buffer = model.rollout_buffer
+        return buffer.episode_starts[0].all() and np.abs(buffer.observations[0]).max() <= 0.05
 
-        def _on_rollout_start(self):
-            assert np.allclose(self.model._last_obs, env.normalize_obs(observation(env)), atol=1e-5)
-            assert self.model._last_episode_starts.all()
-
-    model.learn(20, First(), reset_num_timesteps=False)
+    rollouts = Record(fail)
+    make("steps", env).learn(64, rollouts)
+    assert rollouts.records == [True] * 4
 
 
 class Interrupted(ActorCriticPolicy):
@@ -78,23 +76,16 @@ def test_ctrl_c_leaves_no_candidate_in_the_policy():
     assert plain(model.policy.state_dict()) == before and model._last_obs is None
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@all_kinds
 def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind):
-    class Measure(BaseCallback):
-        n_made = 0
-
-        def _on_rollout_start(self):
-            with undisturbed(self.model):
-                self.n_made += 1
-
-        def _on_step(self):
-            with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
-                self._on_rollout_start()
+    def measure(model):
+        with undisturbed(model):
             return True
 
-        def _on_rollout_end(self):
-            self._on_rollout_start()
+    def refused(model):
+        with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
+            measure(model)
 
-    callback = Measure()
-    model = make(kind).learn(50, callback)
-    assert callback.n_made == 2 * model._n_updates > 0
+    starts, ends = Record(measure, "rollout_start"), Record(measure, "rollout_end")
+    model = make(kind).learn(50, [starts, Record(refused, "step"), ends])
+    assert len(starts.records) == len(ends.records) == model._n_updates > 0
