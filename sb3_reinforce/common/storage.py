@@ -103,9 +103,8 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
             shapes = dict.fromkeys(moments, tuple(parameters[index].shape))
         for key, shape in shapes.items():
             if key not in moments or np.shape(moments[key]) not in ((), shape):
-                return (
-                    f"its {key} of parameter {index} must have shape {shape}, got {tuple(np.shape(moments.get(key)))}"
-                )
+                got = tuple(np.shape(moments.get(key)))
+                return f"its {key} of parameter {index} must have shape {shape}, got {got}"
     return ""
 
 

@@ -45,11 +45,6 @@ def as_reward(reward: Any, env: int) -> float:
     return float(values.item())
 
 
-def has_form(space: spaces.Space[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    """Whether an array may be an observation: integers may stand for real numbers, but not fractions for integers."""
-    return shape == space.shape and dtype.kind in ("biuf" if np.dtype(space.dtype).kind == "f" else "biu")
-
-
 def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
     """Check the form of one observation, which a VecEnv would silently broadcast, cut or round to its space."""
     if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == space.shape and type(space) is spaces.Box:
@@ -67,7 +62,9 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
         values = np.asarray(obs)
     except ValueError as error:
         raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
-    if not has_form(space, values.shape, values.dtype):
+    # Integers may stand for real numbers, but not fractions for integers
+    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
+    if values.shape != space.shape or values.dtype.kind not in kinds:
         raise BadData(
             f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
             f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"

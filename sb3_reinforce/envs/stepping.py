@@ -22,12 +22,10 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
-    # One array, unless observations are dicts
-    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
-    # The usual observation is written at once; to compare two shapes takes as long as all else here
-    is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
-    dtype = rows.dtype if is_vector else None
-    size = rows.shape[1] if is_vector else 0
+    # The usual observation is written at once
+    is_box = isinstance(env.observation_space, spaces.Box)
+    rows: Any = env.buf_obs[None] if is_box else np.empty(0)  # type: ignore[index]
+    form = (rows.dtype, rows.shape[1:])
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         try:
@@ -43,7 +41,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is np.ndarray and obs.dtype is dtype and obs.ndim == 1 and len(obs) == size:
+        if is_box and type(obs) is np.ndarray and (obs.dtype, obs.shape) == form:
             rows[i] = obs
         else:
             write(env, i, obs)

@@ -69,8 +69,7 @@ class GymnasiumVecEnv(VecEnv):
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
         rewards = np.asarray(rewards)
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
-            got = f"shape {rewards.shape} and dtype {rewards.dtype}"
-            raise BadData(f"The rewards must be {self.num_envs} numbers, one for each environment, got {got}")
+            raise BadData(f"The rewards must be {self.num_envs} numbers, one an environment, got {rewards.tolist()}")
         check_batch(self.observation_space, obs, self.num_envs)
         dones = terminated | truncated
         ended = np.flatnonzero(dones).tolist()

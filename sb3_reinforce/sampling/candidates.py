@@ -52,10 +52,9 @@ class EpisodeTracker:
         self.totals += rewards
         self.clock += 1
         if self.clock > self.deadline:
-            env = int(np.argmax(self.active & (self.started_at + self.max_episode_steps == self.deadline)))
             raise ValueError(
-                f"An episode in environment {env} has not ended after max_episode_steps={self.max_episode_steps} "
-                "steps: give it a time limit, or raise max_episode_steps. The policy is the one before this update."
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps: give the "
+                "environment a time limit, or raise max_episode_steps. The policy is the one before this update."
             )
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
@@ -91,8 +90,10 @@ def evaluate_candidates(
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
         env.reset()
-    for queue in schedule_episodes(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
-        tracker = EpisodeTracker(queue, env.num_envs, max_episode_steps)
+    queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(len(thetas))]
+    size = len(queue) if seeds is None else env.num_envs
+    for first in range(0, len(queue), size):
+        tracker = EpisodeTracker(queue[first : first + size], env.num_envs, max_episode_steps)
         obs = start_episodes(env, tracker.pairs, seeds)
         check_finite("The observation", obs, (None,))
         started = list(range(len(tracker.pairs)))
@@ -110,24 +111,15 @@ def evaluate_candidates(
     return returns
 
 
-def schedule_episodes(n_candidates: int, n_episodes: int, n_envs: int, in_rounds: bool) -> list[list[Pair]]:
-    """All pairs, the first episodes first, in one queue or in rounds of at most ``n_envs``."""
-    queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(n_candidates)]
-    size = n_envs if in_rounds else len(queue)
-    return [queue[first : first + size] for first in range(0, len(queue), size)]
-
-
 def start_episodes(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> Any:
     """The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``."""
     # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
     # all that follows, which goes through every wrapper, continues its random numbers
     if seeds is not None:
-        envs_with: dict[int, list[int]] = {}
-        for i, pair in enumerate(pairs):
-            envs_with.setdefault(int(seeds[pair]), []).append(i)
-        for seed, envs in envs_with.items():
+        starts = np.array([seeds[pair] for pair in pairs])
+        for seed in np.unique(starts).tolist():
             try:
-                env.env_method("reset", seed=seed, indices=envs)
+                env.env_method("reset", seed=seed, indices=np.flatnonzero(starts == seed).tolist())
             except NotImplementedError as error:
                 raise ValueError(
                     "Candidates that are to start from the same seeds need env_method('reset', seed=...), which "

@@ -258,6 +258,6 @@ def test_large_finite_numbers_are_no_error():
 def test_an_episode_that_does_not_end_is_named(seeded):
     seeds = np.zeros((3, 1), dtype=int) if seeded else None
     env = make_vec_env(Counting, 2)
-    with pytest.raises(ValueError, match="episode in environment 0 has not ended after max_episode_steps=8 steps"):
+    with pytest.raises(ValueError, match="An episode has not ended after max_episode_steps=8 steps"):
         evaluate(env, [2, 3, 9], seeds, max_episode_steps=8)
     evaluate(env, [2, 3, 9], seeds, max_episode_steps=9)
