@@ -253,7 +253,8 @@ def test_episodes_that_gymnasium_records():
 
 
 @both_modes
-def test_copies_in_other_processes_start_from_the_same_seeds(mode):
+@pytest.mark.parametrize("estimator", ["central", "regression"])
+def test_copies_in_other_processes_start_from_the_same_seeds(estimator, mode):
     """By which a search compares its candidates."""
 
     def env_fn():
@@ -262,7 +263,7 @@ def test_copies_in_other_processes_start_from_the_same_seeds(mode):
     thetas, utilities = [], []
     for vector_env in (SyncVectorEnv, AsyncVectorEnv):
         env = synced(env_fn, mode, vector_env)
-        model = FiniteDifference("LinearPolicy", env, n_delta=11, seed=0).learn(60)
+        model = FiniteDifference("LinearPolicy", env, estimator=estimator, n_delta=11, seed=0).learn(60)
         thetas.append(model.theta)
         utilities.append(landscape(model, n_points=3, n_episodes=2).utilities)
         env.close()
