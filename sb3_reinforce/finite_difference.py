@@ -226,8 +226,8 @@ class FiniteDifference(BasePolicyGradient):
         n = self.n_parameters
         if self.estimator == "regression" and cast(int, self.n_delta) <= n:
             warnings.warn(
-                f"n_delta={self.n_delta} perturbations do not determine the gradient of {n} parameters and an intercept: "
-                "the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
+                f"n_delta={self.n_delta} perturbations do not determine the gradient of {n} parameters and an "
+                "intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
                 stacklevel=3,
             )
         callback.on_training_start(locals(), globals())
