@@ -20,7 +20,7 @@ from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import set_temperature
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor, mode
+from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import (
     evaluate_candidates,
     start_episodes,
@@ -135,17 +135,6 @@ def test_an_error_in_prediction_leaves_the_policy_as_it_was():
     with pytest.raises(ValueError, match="Unexpected observation shape"):
         together.act(np.zeros((K, 5), dtype=np.float32))
     assert th.equal(parameters.read(actor), before)
-
-
-@pytest.mark.parametrize("actions", ACTIONS, ids=str)
-def test_the_mode_is_that_of_the_distribution(actions):
-    policy = ActorCriticPolicy(BOX, actions, lambda _: 1e-3)
-    with th.no_grad():
-        policy.action_net.weight.mul_(1000)
-        obs = th.as_tensor(sample(BOX, 50))
-        outputs = policy.action_net(policy.mlp_extractor.forward_actor(obs))
-        expected = policy.get_distribution(obs).get_actions(deterministic=True)
-    assert th.equal(mode(outputs, actions), expected)
 
 
 @pytest.mark.parametrize("temperature", [1, 3])
