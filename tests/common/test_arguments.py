@@ -79,12 +79,10 @@ def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
     assert model._last_obs is None and model.num_timesteps == 0
 
 
-class RecurrentActorCriticPolicy(ActorCriticPolicy):
-    """Has the name of sb3-contrib's."""
-
-
-class MaskableActorCriticPolicy(ActorCriticPolicy):
-    """Has the name of sb3-contrib's."""
+RECURRENT, MASKABLE = (
+    type(name, (ActorCriticPolicy,), {"__doc__": "Has the name of sb3-contrib's."})
+    for name in ("RecurrentActorCriticPolicy", "MaskableActorCriticPolicy")
+)
 
 
 @pytest.mark.parametrize(
@@ -100,8 +98,8 @@ class MaskableActorCriticPolicy(ActorCriticPolicy):
         ("steps", {"policy": "MLPPolicy"}, ["policy", "'CnnPolicy'", "'MLPPolicy': did you mean 'MlpPolicy'?"]),
         ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
         ("steps", {"policy": "MlpLstmPolicy"}, ["policy", "recurrent", "MlpLstmPolicy", "VecFrameStack"]),
-        ("search", {"policy": RecurrentActorCriticPolicy}, ["policy", "recurrent", "VecFrameStack"]),
-        ("steps", {"policy": MaskableActorCriticPolicy}, ["policy", "masked", "logits", "MaskablePPO"]),
+        ("search", {"policy": RECURRENT}, ["policy", "recurrent", "VecFrameStack"]),
+        ("steps", {"policy": MASKABLE}, ["policy", "masked", "logits", "MaskablePPO"]),
         ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
         ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
