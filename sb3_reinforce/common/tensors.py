@@ -17,7 +17,7 @@ def flatten(tensors: TensorOrDict) -> TensorOrDict:
     return {key: part.flatten(0, 1) for key, part in tensors.items()}
 
 
-def take(tensors: TensorOrDict, index: th.Tensor | slice) -> TensorOrDict:
+def take(tensors: TensorOrDict, index: th.Tensor | slice | int) -> TensorOrDict:
     """``tensors[index]``, for each tensor of a dict; for arrays too."""
     if isinstance(tensors, dict):
         return {key: part[index] for key, part in tensors.items()}

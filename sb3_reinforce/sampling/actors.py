@@ -156,10 +156,13 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
     noise = th.empty(n_envs, width)
     epsilon = noise.numpy()
     log_sigma = log_std.detach().numpy()
+    sigma = np.empty_like(log_sigma)
 
     def sample(means: Floats) -> Any:
         noise.normal_()
-        return means + np.exp(log_sigma) * epsilon
+        np.exp(log_sigma, sigma)
+        np.multiply(epsilon, sigma, epsilon)
+        return means + epsilon
 
     return sample
 
