@@ -66,7 +66,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     which would move the policy a second time. The policy step trains it: ``vf_coef`` times the critic's squared error
     is then part of its loss.
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, or a class)
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a class)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
