@@ -59,8 +59,8 @@ class FiniteDifference(BasePolicyGradient):
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
     the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it.
 
-    :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, or a subclass of
-        ``ActorCriticPolicy``)
+    :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
+        subclass of ``ActorCriticPolicy``)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param estimator: ``"regression"``, ``"central"``, ``"forward"``, or a function of a utility, θ of shape ``(n,)``
