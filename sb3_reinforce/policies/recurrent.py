@@ -1,4 +1,8 @@
-"""The recurrent policies of sb3-contrib, as RecurrentREINFORCE trains them."""
+"""
+The recurrent policies of sb3-contrib, as RecurrentREINFORCE trains them.
+
+They take the arguments of sb3-contrib's classes of the same names, and ``memory``: "lstm", "gru" or "rnn".
+"""
 
 from sb3_contrib.common.recurrent.policies import (
     RecurrentActorCriticCnnPolicy,
@@ -10,12 +14,12 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 
 class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
-    """For observations that are vectors."""
+    """A recurrent policy for observations that are vectors."""
 
 
 class CnnLstmPolicy(RecurrentPolicy, RecurrentActorCriticCnnPolicy):
-    """For images."""
+    """A recurrent policy for images."""
 
 
 class MultiInputLstmPolicy(RecurrentPolicy, RecurrentMultiInputActorCriticPolicy):
-    """For Dict observations."""
+    """A recurrent policy for Dict observations."""
