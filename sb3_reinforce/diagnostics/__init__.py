@@ -5,11 +5,10 @@ Re-exports the public names of its modules. ``plots``, which needs matplotlib, i
 """
 
 from sb3_reinforce.diagnostics.baseline_comparison import BaselineRow, compare_baselines
+from sb3_reinforce.diagnostics.callbacks import GradientQualityCallback, PitfallCallback
 from sb3_reinforce.diagnostics.estimator_comparison import EstimatorRow, compare_estimators
 from sb3_reinforce.diagnostics.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, Landscape, landscape
-from sb3_reinforce.diagnostics.pitfall_callback import PitfallCallback
-from sb3_reinforce.diagnostics.quality_callback import GradientQualityCallback
 from sb3_reinforce.diagnostics.sampling import sample
 from sb3_reinforce.diagnostics.statistics import GradientStatistics, gradient_statistics
 from sb3_reinforce.diagnostics.tables import Estimate, Table

@@ -8,7 +8,7 @@ from typing import cast
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
-from sb3_reinforce.diagnostics.sampling import check_independent, check_model, sample, seeded
+from sb3_reinforce.diagnostics.sampling import check_model, sample, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise, variance
 from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resamples
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline, ratio_of_others
@@ -72,8 +72,7 @@ def compare_baselines(
         critic, the reference is not among the baselines, or the episodes are not independent because they share the
         noise of gSDE
     """
-    check_model(model)
-    check_independent(model)
+    check_model(model, independent=True)
     functions = functions_of(model, baselines)
     check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
@@ -121,14 +120,14 @@ def baseline_rows(
     rollout: Rollout, functions: dict[str, Baseline], reference: str, counts: th.Tensor, confidence: float
 ) -> list[BaselineRow]:
     """The rows of ``compare_baselines`` from whole episodes, with ``counts`` (r, m) of their resamples."""
-    values = {}
+    weights = {}
     seconds = {"floor": float("nan")}
     for name, function in functions.items():
         if function is not BASELINES["optimal"]:
             begin = time.perf_counter()
-            values[name] = th.as_tensor(check_baseline(function(rollout), rollout))
+            weights[name] = weights_by(function, rollout)
             seconds[name] = time.perf_counter() - begin
-    grams, seconds["optimal"] = gram_matrices(rollout, values)
+    grams, seconds["optimal"] = gram_matrices(rollout, weights)
     moments = {name: compute_moments(grams[name], counts) for name in (*functions, "floor")}
     return [
         BaselineRow(
@@ -141,6 +140,11 @@ def baseline_rows(
         )
         for name, of in moments.items()
     ]
+
+
+def weights_by(baseline: Baseline, rollout: Rollout) -> th.Tensor:
+    """``γ^t (G_t − b_t)`` with a baseline, shape ``(n_steps, n_envs)``, float64."""
+    return rollout.discounts * (rollout.returns - th.as_tensor(check_baseline(baseline(rollout), rollout)))
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
@@ -156,48 +160,30 @@ def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
     return 1 / len(lengths) if own_return_in_mean else float("nan")
 
 
-def gram_matrices(rollout: Rollout, baselines: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
+def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
     """
-    ``K_ij = ⟨g_i, g_j⟩`` (m, m) by baseline b_t (n_steps, n_envs), for ``"optimal"`` and for the ``"floor"``; and the
-    seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
+    ``K_ij = ⟨g_i, g_j⟩`` (m, m) for weights (n_steps, n_envs) by baseline, ``"none"`` first, for ``"optimal"`` and for
+    the ``"floor"``; and the seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
 
-    A baseline b that is constant along an episode leaves A − b S, so that its K, and that of the optimal one, follow
-    from the products of A and S. Every other baseline is one more weight in the same pass.
+    The optimal baseline b leaves A − b S, so that its K follows from the products of A and S.
     """
-    rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)[1]
-    n_episodes = int(rank.max()) + 1
-    constants: dict[str, th.Tensor] = {}
-    weights: dict[str, th.Tensor] = {}
-    for name, baseline in baselines.items():
-        along = baseline[rollout.used]
-        b = along.new_zeros(n_episodes).index_copy_(0, rank, along)
-        if th.equal(b[rank], along):
-            constants[name] = b
-        else:
-            weights[name] = rollout.discounts * (rollout.returns - baseline)
-
-    names = ("A A", "A S", "S S", "floor", *weights)
-    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in names}
+    n_episodes = len(th.unique(rollout.episodes[rollout.used]))
+    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in (*weights, "A S", "S S", "floor")}
     seconds = 0.0
     begin = time.perf_counter()
-    for weighted, scores, *others in gradient_blocks(
-        rollout, rollout.discounts * rollout.returns, rollout.discounts, *weights.values()
-    ):
-        seconds += (time.perf_counter() - begin) * 2 / (2 + len(others))
-        products = gram(th.cat([weighted, scores]))
-        found["A A"] += products[:n_episodes, :n_episodes]
-        found["A S"] += products[:n_episodes, n_episodes:]
-        found["S S"] += products[n_episodes:, n_episodes:]
-        found["floor"] += gram(componentwise_residuals(weighted, scores))
-        for name, gradients in zip(weights, others, strict=True):
-            found[name] += gram(gradients)
+    for scores, *gradients in gradient_blocks(rollout, rollout.discounts, *weights.values()):
+        seconds += (time.perf_counter() - begin) * 2 / (1 + len(gradients))
+        for name, each in zip(weights, gradients, strict=True):
+            found[name] += gram(each)
+        found["A S"] += gram(gradients[0], scores)
+        found["S S"] += gram(scores)
+        found["floor"] += gram(componentwise_residuals(gradients[0], scores))
         begin = time.perf_counter()
-    a_a, a_s, s_s = (found.pop(name) for name in ("A A", "A S", "S S"))
-    # As the baseline itself computes them, from the products that are already here
-    constants["optimal"] = ratio_of_others(a_s.diagonal(), s_s.diagonal())
-    for name, b in constants.items():
-        # ⟨A_i − b_i S_i, A_j − b_j S_j⟩
-        found[name] = a_a - a_s * b - (a_s * b).T + s_s * b * b[:, None]
+    a_s, s_s = found.pop("A S"), found.pop("S S")
+    # As the baseline itself computes it, from the products that are already here
+    b = ratio_of_others(a_s.diagonal(), s_s.diagonal())
+    # ⟨A_i − b_i S_i, A_j − b_j S_j⟩
+    found["optimal"] = found["none"] - a_s * b - (a_s * b).T + s_s * b * b[:, None]
     return found, seconds
 
 

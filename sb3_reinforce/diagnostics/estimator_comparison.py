@@ -4,12 +4,13 @@ import copy
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import torch as th
 
-from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
+from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number, check_unless_none
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
-from sb3_reinforce.diagnostics.sampling import check_independent, collect_episodes, env_of, seeded
+from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
 from sb3_reinforce.estimation import baselines
@@ -81,9 +82,7 @@ def compare_estimators(
     :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
         episodes are not independent because they share the noise of gSDE
     """
-    if not isinstance(model, REINFORCE | FiniteDifference):
-        raise TypeError(f"model must be a REINFORCE or FiniteDifference, got {model!r} of type {type(model).__name__}")
-    check_independent(model)
+    check_model(model, (REINFORCE, FiniteDifference), independent=True)
     names = (estimators,) if isinstance(estimators, str) else tuple(estimators)
     for name in names or ("",):
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
@@ -91,10 +90,8 @@ def compare_estimators(
     check_integer("n_estimates", n_estimates, 3)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
-    if n_delta is not None:
-        check_integer("n_delta", n_delta, 2)
-    if delta_std is not None:
-        check_number("delta_std", delta_std, 0, above=True)
+    check_unless_none("n_delta", n_delta, partial(check_integer, low=2))
+    check_unless_none("delta_std", delta_std, partial(check_number, low=0, above=True))
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
     utility = CandidateUtility(model, 1, seed)
     n_parameters = len(utility.theta)
@@ -105,12 +102,14 @@ def compare_estimators(
         reference = likelihood_ratio(model, n_episodes)[0]
         for name in names:
             begin = time.perf_counter()
+            n_steps_before = utility.n_steps
             if name == LIKELIHOOD_RATIO:
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
                 k = default_n_delta(name, n_parameters) if n_delta is None else n_delta
                 deltas = (scale * draw(k, n_parameters, generator) for _ in range(n_estimates))
-                gradients, n_steps = finite_differences(utility, name, deltas)
+                gradients = th.stack([ESTIMATORS[name](utility, utility.theta, each) for each in deltas])
+                n_steps = utility.n_steps - n_steps_before
             seconds = (time.perf_counter() - begin) / len(gradients)
             steps = n_steps / len(gradients)
             to_reference, snr = judge(gradients, reference, n_resamples, confidence, seed)
@@ -134,16 +133,9 @@ def judge(
     others = resamples(len(reference), n_resamples, seed + 1)
     moments = compute_moments(gram(gradients), counts)
     # ⟨E g, E r⟩ of each pair of resamples
-    products = (counts @ (gradients @ reference.T) * others).sum(1) / (counts.sum(1) * others.sum(1))
+    products = (counts @ gram(gradients, reference) * others).sum(1) / (counts.sum(1) * others.sum(1))
     to_reference = cosine(moments, compute_moments(gram(reference), others), products, confidence)
     return to_reference, interval(signal_to_noise(moments), confidence)
-
-
-def finite_differences(utility: CandidateUtility, name: str, deltas: Iterable[th.Tensor]) -> tuple[th.Tensor, int]:
-    """One gradient for each of m perturbations ``(k, n)``, shape ``(m, n)``, and the environment steps of all."""
-    before = utility.n_steps
-    gradients = [ESTIMATORS[name](utility, utility.theta, each) for each in deltas]
-    return th.stack(gradients), utility.n_steps - before
 
 
 def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tuple[th.Tensor, int]:
@@ -151,16 +143,15 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``, shape
     ``(n_episodes, n)``, float64; and the environment steps of all environments.
     """
-    env = env_of(model)
     collector = undiscounted(model).sampling_copy(n_episodes, "leave_one_out")
     with undisturbed(model):
-        env.seed(int(th.randint(2**31, ())))
-        rollout, infos = collect_episodes(collector)
+        env_of(model).seed(int(th.randint(2**31, ())))
+        rollout, _ = collect_episodes(collector)
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
     wanted = {id(parameter) for parameter in actor_parameters(rollout.policy)}
     mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
-    return gradients[:, mask], len(infos) * env.num_envs
+    return gradients[:, mask], rollout.dones.numel()
 
 
 def undiscounted(model: REINFORCE | FiniteDifference) -> REINFORCE:

@@ -10,7 +10,7 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from sb3_reinforce.common.arguments import check_function, check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, stack, to_vector
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, some
+from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, spread
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
@@ -116,8 +116,8 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     obs = select(rollout.observations, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
     return {
-        "log_prob": log_prob_error(policy, some(obs, actions)[0]),
-        "scores": score_error(policy, *some(obs, actions)),
+        "log_prob": log_prob_error(policy, spread(obs, actions)[0]),
+        "scores": score_error(policy, *spread(obs, actions)),
         "sign": sign_error(policy, obs),
         "returns": return_error(collector, rollout, infos),
         "weights": weight_error(collector, rollout),
@@ -143,8 +143,7 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
 
 def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
     """The largest difference between a return and its definition, relative to the largest return."""
-    error = 0.0
-    scale = 1e-12
+    expected = th.zeros_like(rollout.returns)
     for episode in th.unique(rollout.episodes[rollout.used]):
         steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
         values = np.zeros(len(steps))
@@ -156,12 +155,10 @@ def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
                 with th.no_grad():
                     values[-1] = float(rollout.policy.predict_values(terminal))
         rewards = rollout.rewards[steps, envs].numpy()
-        expected = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
-        if not collector.reward_to_go:
-            expected[:] = expected[0]
-        error = max(error, float(np.abs(rollout.returns[steps, envs].numpy() - expected).max()))
-        scale = max(scale, float(np.abs(expected).max()))
-    return error / scale
+        returns = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
+        expected[steps, envs] = th.as_tensor(returns if collector.reward_to_go else np.full_like(returns, returns[0]))
+    differences = (rollout.returns - expected)[rollout.used]
+    return float(differences.abs().max() / expected.abs().max().clamp(min=1e-12))
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:

@@ -14,8 +14,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
+from sb3_reinforce.policies.plain_mlp import temperature_hooks
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -35,11 +37,6 @@ class Update:
     n_steps: int  # steps used
     used_fraction: float  # share of the steps that were used
     temperature: float = 1.0  # of the rollout
-
-    @property
-    def has_returns_to_explain(self) -> bool:
-        """Whether there is a critic, and returns vary by a tenth of their size: a pole that never falls has none."""
-        return math.isfinite(self.explained_variance) and self.return_std > 0.1 * self.return_scale
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,9 @@ def spikes_without_clipping(history: History) -> str | None:
 
 def useless_critic(history: History) -> str | None:
     """Values that explain none of the variance of the returns, after 100 updates and half of the training."""
-    explained = [update.explained_variance for update in history.updates if update.has_returns_to_explain]
+    # Returns that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
+    varied = [update for update in history.updates if update.return_std > 0.1 * update.return_scale]
+    explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]
     late = history.n_updates >= 100 and history.progress_remaining < 0.5
     if history.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
         return (
@@ -182,6 +181,21 @@ def randomness(space: spaces.Space[Any], update: Update) -> float:
     else:
         largest = math.log(2) * math.prod(space.shape or ())
     return update.entropy / largest if largest > 0 else float("nan")
+
+
+def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
+    """The mean standard deviation of a Gaussian policy's actions, which with gSDE ``train/std`` is not; else NaN."""
+    if not isinstance(policy.action_space, spaces.Box):
+        return math.nan
+    distribution = policy.get_distribution(obs).distribution
+    return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
+
+
+def temperature_of(policy: ActorCriticPolicy) -> float:
+    """The temperature at which a policy acts."""
+    layer = getattr(policy, "action_net", None)
+    hooks = temperature_hooks(layer) if layer is not None else []
+    return float(hooks[0].temperature) if hooks else 1.0
 
 
 def cut_episodes(history: History) -> str | None:

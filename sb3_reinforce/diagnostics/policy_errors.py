@@ -13,11 +13,7 @@ from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
 from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
 
-# Draws behind a frequency or a mean action, and for observations of more elements than LARGE
-N_DRAWS = 1024
-N_DRAWS_LARGE = 256
-LARGE = 4096
-# Elements of the observations for which log π is differentiated by finite differences
+# Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
 
 
@@ -35,14 +31,18 @@ def log_prob_error(policy: ActorCriticPolicy, obs: PyTorchObs) -> float:
     return float(((evaluated - log_prob).abs() / log_prob.abs().clamp(min=1)).max())
 
 
+def parts_of(obs: PyTorchObs) -> list[th.Tensor]:
+    """The tensors of a batch of observations."""
+    return list(obs.values()) if isinstance(obs, dict) else [obs]
+
+
 def size_of(obs: PyTorchObs) -> int:
     """The number of elements of one observation."""
-    parts = list(obs.values()) if isinstance(obs, dict) else [obs]
-    return sum(part[0].numel() for part in parts)
+    return sum(part[0].numel() for part in parts_of(obs))
 
 
-def some(obs: PyTorchObs, actions: th.Tensor) -> tuple[PyTorchObs, th.Tensor]:
-    """Steps spread evenly over n observations and actions, as many as ``N_ELEMENTS`` allow."""
+def spread(obs: PyTorchObs, actions: th.Tensor) -> tuple[PyTorchObs, th.Tensor]:
+    """Steps spread evenly over observations and actions, as many as ``N_ELEMENTS`` allow."""
     allowed = max(1, N_ELEMENTS // size_of(obs))
     steps = th.arange(0, len(actions), -(-len(actions) // allowed))
     return take(obs, steps), actions[steps]
@@ -73,22 +73,22 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, 
     # In float32 the rounding of log π and the third derivative usually balance near eps^(1/3), the first h
     for h in (5e-3, 5e-4, 5e-5):
         step = h * max(1.0, float(theta.norm()))
-        differences = th.stack([difference(objective, parameters, theta, step * each) for each in directions])
-        errors.append(relative_difference(directions.double() @ gradient, differences / (2 * step)))
+        plus = values_at(theta + step * directions, parameters, objective)
+        minus = values_at(theta - step * directions, parameters, objective)
+        errors.append(relative_difference(directions.double() @ gradient, (plus - minus) / (2 * step)))
     return min(errors)
 
 
 @th.no_grad()
-def difference(
-    function: Callable[[], th.Tensor], parameters: Parameters, theta: th.Tensor, step: th.Tensor
-) -> th.Tensor:
-    """``f(θ + step) − f(θ − step)``, where f depends on the parameters, which are left at θ (n,)."""
+def values_at(thetas: th.Tensor, parameters: Parameters, function: Callable[[], th.Tensor]) -> th.Tensor:
+    """``f(θ)`` (k,) at θs (k, n), where f depends on the parameters, which are as before afterwards."""
+    before = to_vector(parameters)
     values = []
-    for moved in (theta + step, theta - step):
-        th.nn.utils.vector_to_parameters(moved, parameters)
+    for theta in thetas:
+        th.nn.utils.vector_to_parameters(theta, parameters)
         values.append(function())
-    th.nn.utils.vector_to_parameters(theta, parameters)
-    return values[0] - values[1]
+    th.nn.utils.vector_to_parameters(before, parameters)
+    return th.stack(values)
 
 
 def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -> float:
@@ -97,25 +97,25 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -
 
     It is measured from what the policy samples, not from log π (see ``closeness``). NaN if all samples are equal.
     """
-    n_obs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
-    n_draws = N_DRAWS_LARGE if size_of(obs) > LARGE else N_DRAWS
+    n_obs = len(parts_of(obs)[0])
+    n_draws = max(256, min(1024, N_ELEMENTS // size_of(obs)))
     wrong = []
     for index in th.randperm(n_obs)[:n_actions]:
         repeated = take(obs, index.repeat(n_draws))
-        with th.no_grad():
-            draws = draw(policy, repeated, n_draws)
+        draws = draw(policy, repeated)
         # The effect of a step is clearest for the action that is farthest from the rest
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
-        before, after = closeness_after_step(policy, repeated, action, n_draws)
+        before, after = closeness_after_step(policy, repeated, action)
         if before < closeness(policy, action[None].expand_as(draws), action):
             wrong.append(bool(after <= before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
 
 
-def draw(policy: ActorCriticPolicy, obs: PyTorchObs, n_draws: int) -> th.Tensor:
-    """Independent actions for one observation, repeated ``n_draws`` times; with gSDE each has its own noise matrix."""
+@th.no_grad()
+def draw(policy: ActorCriticPolicy, obs: PyTorchObs) -> th.Tensor:
+    """Independent actions for a batch of observations; with gSDE each has its own noise matrix."""
     if policy.use_sde:
-        policy.reset_noise(n_draws)
+        policy.reset_noise(len(parts_of(obs)[0]))
     return as_evaluated(policy, policy(obs)[0])
 
 
@@ -127,22 +127,19 @@ def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) ->
     return (draws == action).double().mean()
 
 
-def closeness_after_step(
-    policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor, n_draws: int
-) -> tuple[th.Tensor, th.Tensor]:
-    """``closeness`` before and after a step along the score of an action, with the same random numbers."""
-    first = take(obs, th.arange(1))
+def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
+    """``closeness`` before and after a step along the score of an action, (2,), with the same random numbers."""
+    first = take(obs, slice(1))
     parameters = score_parameters(policy, first, action[None])
     log_prob, _ = log_prob_and_entropy(policy, first, action[None])
     gradient = to_vector(th.autograd.grad(log_prob.sum(), parameters))
     theta = to_vector(parameters)
     # To first order, log π(a|s) rises by 0.3
     step = 0.3 * gradient / gradient.square().sum().clamp(min=1e-12)
-    results = []
     seed = int(th.randint(2**31, ()))
-    for values in (theta, theta + step):
-        th.nn.utils.vector_to_parameters(values, parameters)
-        with seeded(policy, seed), th.no_grad():
-            results.append(closeness(policy, draw(policy, obs, n_draws), action))
-    th.nn.utils.vector_to_parameters(theta, parameters)
-    return results[0], results[1]
+
+    def measured() -> th.Tensor:
+        with seeded(policy, seed):
+            return closeness(policy, draw(policy, obs), action)
+
+    return values_at(th.stack([theta, theta + step]), parameters, measured)

@@ -2,32 +2,21 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.arguments import check_integer, check_kind
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import compute_weights
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
-
-
-class InfoRecorder(BaseCallback):
-    """Keeps the infos of every step: ``infos[t][i]`` of environment i."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.infos: list[list[dict[str, Any]]] = []
-
-    def _on_step(self) -> bool:
-        self.infos.append(self.locals["infos"])
-        return True
 
 
 def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Rollout:
@@ -54,10 +43,16 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
 
 def collect_episodes(collector: REINFORCE) -> tuple[Rollout, list[list[dict[str, Any]]]]:
     """Let a sampling copy collect its episodes; the rollout, and ``infos[t][i]`` of each step and environment."""
-    recorder = InfoRecorder()
+    infos: list[list[dict[str, Any]]] = []
+
+    def record(variables: dict[str, Any], _: dict[str, Any]) -> bool:
+        infos.append(variables["infos"])
+        return True
+
+    recorder = ConvertCallback(record)
     recorder.init_callback(collector)
     collector.collect_rollouts(cast(VecEnv, collector.env), recorder, collector.rollout_buffer, None)
-    return cast(Rollout, collector.rollout), recorder.infos
+    return cast(Rollout, collector.rollout), infos
 
 
 @contextmanager
@@ -77,10 +72,15 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
             policy.set_training_mode(training)
 
 
-def check_model(model: Any) -> VecEnv:
-    """Check that a model is a REINFORCE with environments, and return these."""
-    if not isinstance(model, REINFORCE):
-        raise TypeError(f"model must be a REINFORCE, got {model!r} of type {type(model).__name__}")
+def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> VecEnv:
+    """Check the kind of a model, or also that its episodes are independent samples, and return its environments."""
+    check_kind("model", model, kinds, f"a {' or '.join(kind.__name__ for kind in kinds)}")
+    if independent and model.use_sde and model.sde_sample_freq != 1:
+        raise ValueError(
+            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, and the "
+            "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
+            "without use_sde"
+        )
     return env_of(model)
 
 
@@ -91,23 +91,19 @@ def env_of(model: BaseAlgorithm) -> VecEnv:
     return model.env
 
 
-def check_independent(model: BaseAlgorithm) -> None:
-    """Check that episodes of a model are independent samples, as the statistics of their gradients assume."""
-    if model.use_sde and model.sde_sample_freq != 1:
-        raise ValueError(
-            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, and the "
-            "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
-            "without use_sde"
-        )
-
-
 def training_weights(model: REINFORCE) -> th.Tensor:
-    """
-    The weights of the scores in ``train()``: γ^t (G_t − b_t), normalized if the model does so, shape
-    ``(n_steps, n_envs)``, float64.
-    """
+    """γ^t (G_t − b_t) of ``train()``, normalized if the model does so, shape ``(n_steps, n_envs)``, float64."""
     rollout = cast(Rollout, model.rollout)
     advantages, _ = by_step(model.rollout_buffer)
     weights = th.zeros_like(rollout.returns)
     weights[rollout.used] = compute_weights(rollout, advantages, model.normalize_advantage).to(weights)
     return weights
+
+
+def evenly_spread(rollout: Rollout, n_episodes: int) -> Rollout:
+    """A rollout of which only ``n_episodes`` episodes are used, spread evenly over the environments."""
+    numbers = th.unique(rollout.episodes[rollout.used])
+    if len(numbers) <= n_episodes:
+        return rollout
+    kept = numbers[th.linspace(0, len(numbers) - 1, n_episodes).round().long()]
+    return replace(rollout, used=rollout.used & th.isin(rollout.episodes, kept))

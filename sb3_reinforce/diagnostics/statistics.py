@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch as th
 
-from sb3_reinforce.common.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
 from sb3_reinforce.diagnostics.tables import Estimate, interval, resamples
 
 
@@ -21,11 +21,11 @@ class Moments:
     signal: th.Tensor
 
 
-def gram(gradients: th.Tensor) -> th.Tensor:
-    """``K = g gᵀ`` of gradients ``(m, n)``, shape ``(m, m)``, float64, on the CPU."""
-    gradients = gradients.double()
-    product: th.Tensor = (gradients @ gradients.T).cpu()
-    return product
+def gram(gradients: th.Tensor, others: th.Tensor | None = None) -> th.Tensor:
+    """``K = g hᵀ`` of gradients g ``(m, n)`` and others h ``(m', n)``, by default g, float64, on the CPU."""
+    g = gradients.double()
+    h = g if others is None else others.double()
+    return (g @ h.T).cpu()
 
 
 def compute_moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
@@ -97,24 +97,21 @@ class GradientStatistics:
 
 def check_samples(gradients: th.Tensor) -> th.Tensor:
     """Check sampled gradients ``(m, n)``, m ≥ 2, and return them as float64 on the CPU."""
-    if not isinstance(gradients, th.Tensor):
-        raise TypeError(f"gradients must be a tensor, got {gradients!r} of type {type(gradients).__name__}")
+    check_kind("gradients", gradients, (th.Tensor,), "a tensor")
     if gradients.dim() != 2 or len(gradients) < 2 or gradients.shape[1] < 1:
         raise ValueError(
             f"gradients must be of shape (m, n) with m >= 2, since a variance needs two samples, got "
             f"{tuple(gradients.shape)}"
         )
-    if not gradients.isfinite().all():
-        raise ValueError(
-            f"gradients must be finite, and sample {int((~gradients.isfinite()).any(1).nonzero()[0])} is not"
-        )
+    is_finite = gradients.isfinite().all(1)
+    if not is_finite.all():
+        raise ValueError(f"gradients must be finite, and sample {int(is_finite.long().argmin())} is not")
     return gradients.detach().cpu().double()
 
 
 def check_directions(name: str, directions: th.Tensor, shape: tuple[int, ...]) -> th.Tensor:
     """Check directions ``(..., n)`` in the space of parameters, and return them as float64 on the CPU."""
-    if not isinstance(directions, th.Tensor):
-        raise TypeError(f"{name} must be a tensor, got {directions!r} of type {type(directions).__name__}")
+    check_kind(name, directions, (th.Tensor,), "a tensor")
     norms = directions.double().norm(dim=-1)
     if directions.shape != shape or not bool((norms.isfinite() & (norms > 0)).all()):
         raise ValueError(

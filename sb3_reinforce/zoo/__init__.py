@@ -18,8 +18,7 @@ except ImportError as error:
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params
 
 from sb3_reinforce.zoo import samplers
-from sb3_reinforce.zoo.configuration import ALGORITHMS, HYPERPARAMS
-from sb3_reinforce.zoo.experiments import Experiment, make_experiment
+from sb3_reinforce.zoo.experiments import ALGORITHMS, HYPERPARAMS, Experiment, make_experiment
 
 __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 

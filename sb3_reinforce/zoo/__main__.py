@@ -15,7 +15,7 @@ from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.configuration import ConfigurationError, closest
+from sb3_reinforce.zoo.experiments import ConfigurationError, closest
 
 FUNCTIONS = {
     "train": "rl_zoo3.train",
@@ -53,13 +53,10 @@ class StorePython(utils.StoreDict):
 def run_script(command: str) -> None:
     """Run a script of the Zoo; its benchmark calls ``python enjoy.py``, which becomes the ``enjoy`` of this module."""
     call = subprocess.call
-
-    def call_enjoy(arguments: list[str]) -> int:
-        return call([sys.executable, "-m", "sb3_reinforce.zoo", "enjoy", *arguments[2:]])
-
+    enjoy = [sys.executable, "-m", "sb3_reinforce.zoo", "enjoy"]
     if command == "benchmark":
         # A file enjoy.py would have to lie in the user's folder, and `python` may be another interpreter
-        subprocess.call = call_enjoy  # type: ignore[assignment]
+        subprocess.call = lambda arguments: call([*enjoy, *arguments[2:]])  # type: ignore[assignment,misc]
     try:
         runpy.run_module(SCRIPTS[command], run_name="__main__")
     finally:

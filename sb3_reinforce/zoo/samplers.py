@@ -7,7 +7,7 @@ A trial stores the suggested values, such as a power of two; ``train --trial-id`
 import optuna
 from rl_zoo3.hyperparams_opt import convert_onpolicy_params
 
-from sb3_reinforce.zoo.configuration import Settings
+from sb3_reinforce.zoo.experiments import Settings
 
 
 def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:

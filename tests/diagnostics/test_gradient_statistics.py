@@ -29,18 +29,11 @@ def draw(m, generator):
     return MEAN + th.randn(m, 8, dtype=th.float64, generator=generator) @ FACTOR
 
 
-def test_the_moments_are_those_of_the_sample_covariance():
-    gradients = draw(12, th.Generator().manual_seed(0))
-    found = compute_moments(gradients @ gradients.T, th.ones(1, 12, dtype=th.float64))
-    th.testing.assert_close(variance(found)[0], gradients.var(0).sum())
-    th.testing.assert_close(found.second[0], gradients.square().sum(1).mean())
-    th.testing.assert_close(found.signal[0], gradients.mean(0).square().sum() - gradients.var(0).sum() / 12)
-
-
-def test_counts_are_repeated_samples_without_their_pairs_with_themselves():
-    gradients, counts = draw(4, th.Generator().manual_seed(1)), th.tensor([[3.0, 0.0, 2.0, 1.0]], dtype=th.float64)
-    found = compute_moments(gradients @ gradients.T, counts)
-    labels = [0, 0, 0, 2, 2, 3]
+@pytest.mark.parametrize("counts", [(1.0, 1.0, 1.0, 1.0), (3.0, 0.0, 2.0, 1.0)])
+def test_counts_are_repeated_samples_without_their_pairs_with_themselves(counts):
+    gradients = draw(4, th.Generator().manual_seed(1))
+    found = compute_moments(gradients @ gradients.T, th.tensor([counts], dtype=th.float64))
+    labels = [sample for sample, count in enumerate(counts) for _ in range(int(count))]
     pairs = [gradients[i] @ gradients[j] for i, j in product(labels, repeat=2) if i != j]
     th.testing.assert_close(found.signal[0], th.stack(pairs).mean())
     apart = [(gradients[i] - gradients[j]).square().sum() / 2 for i, j in product(labels, repeat=2) if i != j]
@@ -92,7 +85,9 @@ def test_95_percent_intervals_cover_the_truth_in_90_to_98_percent_of_500_repetit
     reference = th.ones(8, dtype=th.float64) + MEAN
     truth = [TRACE, SIGNAL / TRACE, TRACE / SIGNAL, float(MEAN @ reference / MEAN.norm() / reference.norm())]
     for seed in range(500):
-        found = gradient_statistics(draw(m, generator), reference, n_resamples=400, seed=seed)
+        gradients = draw(m, generator)
+        found = gradient_statistics(gradients, reference, n_resamples=400, seed=seed)
+        th.testing.assert_close(found.mean, gradients.mean(0))
         estimates = [found.variance, found.snr, found.noise_scale, found.cosine]
         covered += th.tensor([e.low <= t <= e.high for e, t in zip(estimates, truth, strict=True)]).float()
     assert ((0.90 <= covered / 500) & (covered / 500 <= 0.98)).all(), covered / 500
@@ -131,15 +126,6 @@ def test_the_noise_of_the_reference_does_not_lower_the_cosine():
         gradients, reference = draw(400, generator), draw(40, generator) + shift
         values.append(judge(gradients, reference, 1, 0.95, 0)[0].value)
     assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
-
-
-def test_many_samples_give_the_closed_forms():
-    found = gradient_statistics(draw(4000, th.Generator().manual_seed(5)), MEAN, n_resamples=10)
-    assert found.variance.value == pytest.approx(TRACE, rel=0.05)
-    assert found.snr.value == pytest.approx(SIGNAL / TRACE, rel=0.1)
-    assert found.noise_scale.value == pytest.approx(TRACE / SIGNAL, rel=0.1)
-    assert found.cosine.value > 0.99
-    th.testing.assert_close(found.mean, MEAN, atol=0.2, rtol=0)
 
 
 def test_an_interval_holds_its_estimate_and_can_be_infinite():

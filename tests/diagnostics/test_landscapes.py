@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from enumeration import make_model, true_gradient
 from environments import Corridor, Tree
-from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE, FiniteDifference
@@ -23,26 +22,17 @@ def bandit(algorithm=REINFORCE, **kwargs):
     return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0, **kwargs)
 
 
-def test_the_utility_is_that_of_the_sampling_policy():
-    model = bandit()
-    utility = CandidateUtility(model, 500, seed=0)
-    thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0])
-    with th.no_grad():
-        logits = model.policy.action_net(th.ones(1, 1))[0]
-    shift = float(logits[1] - logits[0])
-    expected = [1 / (1 + np.exp(-shift - 2.0 * x)) for x in (0, 1, -1)]
-    np.testing.assert_allclose(utility(thetas).numpy(), expected, atol=0.08)
-    assert utility.n_steps >= 1500
-    assert utility(thetas.reshape(1, 3, -1)).shape == (1, 3)
-
-
-def test_the_utility_is_that_of_a_policy_with_a_temperature():
-    model = bandit(temperature=0.2)
-    with th.no_grad():
-        model.policy.action_net.bias += th.tensor([0.0, 0.3])
-        expected = model.policy.get_distribution(th.ones(1, 1)).distribution.probs[0, 1]
+@pytest.mark.parametrize("temperature", [1.0, 0.2])
+def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(temperature):
+    model = bandit(temperature=temperature)
     utility = CandidateUtility(model, 1000, seed=0)
-    np.testing.assert_allclose(utility(utility.theta[None]).numpy(), expected, atol=0.06)
+    thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0 * temperature])
+    with th.no_grad():
+        expected = float(model.policy.get_distribution(th.ones(1, 1)).distribution.logits.diff())
+    expected = [1 / (1 + np.exp(-expected - 2.0 * x)) for x in (0, 1, -1)]
+    np.testing.assert_allclose(utility(thetas).numpy(), expected, atol=0.06)
+    assert utility.n_steps >= 3000
+    assert utility(thetas.reshape(1, 3, -1)).shape == (1, 3)
 
 
 def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
@@ -65,7 +55,6 @@ def test_pictures_without_matplotlib_say_what_to_install(monkeypatch):
 @pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])
 def test_all_estimators_see_the_same_gradient(algorithm):
     model = bandit(algorithm)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     table = compare_estimators(model, 200, 60, perturbation="sphere", n_delta=16, delta_std=1.0)
     assert table.names == ["likelihood_ratio", "forward", "central", "regression"]
     assert all(row.cosine.high > 0.95 for row in table)
@@ -74,29 +63,6 @@ def test_all_estimators_see_the_same_gradient(algorithm):
     assert [table[name].steps >= evaluations for name, evaluations in (("forward", 17), ("central", 32))] == [True] * 2
     assert table["likelihood_ratio"].snr_per_step.low > 0
     assert set(table.legend) == {*table.columns[1:], "[a, b]"}
-    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
-    model.learn(32)
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"n_episodes": 2}, "n_episodes must be at least 3"),
-        ({"n_estimates": 1}, "n_estimates must be at least 3"),
-        ({"estimators": ("backward",)}, r"estimators must be one of.*'backward'"),
-        ({"delta_std": 0.0}, "delta_std"),
-        ({"n_delta": 1}, "n_delta must be at least 2"),
-        ({"estimators": "backward"}, "estimators must be one of.*'backward'"),
-        ({"estimators": ()}, "estimators must be one of"),
-        ({"perturbation": "cube"}, "perturbation must be"),
-        ({"confidence": 95}, "confidence"),
-    ],
-)
-def test_a_users_mistake_is_named_before_anything_is_sampled(kwargs, message):
-    model = bandit()
-    model.env.reset = None
-    with pytest.raises((ValueError, TypeError), match=message):
-        compare_estimators(model, **kwargs)
 
 
 def test_by_default_every_estimator_sees_something_on_cartpole():
@@ -109,14 +75,6 @@ def test_by_default_every_estimator_sees_something_on_cartpole():
 
 def test_a_single_name_is_an_estimator():
     assert compare_estimators(bandit(), 10, 3, "central").names == ["central"]
-
-
-def test_other_models_are_refused():
-    model = DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=10)
-    with pytest.raises(TypeError, match="REINFORCE or FiniteDifference"):
-        compare_estimators(model)
-    with pytest.raises(TypeError, match="actor-critic policy"):
-        landscape(model)
 
 
 def test_a_landscape_rises_along_the_gradient():
@@ -137,26 +95,6 @@ def test_directions_are_normalized_filter_by_filter():
     direction = filter_normalized(th.randn(15, dtype=th.float64), like)
     th.testing.assert_close(direction[:12].reshape(3, 4).norm(dim=1), like[0].double().norm(dim=1).detach())
     th.testing.assert_close(direction[12:].norm(), like[1].double().norm().detach())
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"extent": 0}, "extent"),
-        ({"n_points": 1}, "n_points"),
-        ({"n_episodes": 0}, "n_episodes"),
-        ({"directions": th.ones(2, 3)}, r"directions.*\(2, 4\).*\(2, 3\)"),
-        ({"gradients": {"g": th.zeros(4)}}, r"gradients\['g'\].*not zero"),
-        ({"gradients": {"g": [1.0, 2.0]}}, r"gradients\['g'\] must be a tensor, got \[1.0, 2.0\]"),
-        ({"gradients": th.ones(4)}, "gradients must be a dictionary.*Tensor"),
-        ({"directions": [1.0, 2.0]}, "directions must be a tensor"),
-    ],
-)
-def test_a_wrong_plane_is_named_before_it_is_evaluated(kwargs, message):
-    model = bandit()
-    model.env.reset = None
-    with pytest.raises((ValueError, TypeError), match=message):
-        landscape(model, **kwargs)
 
 
 plots = pytest.importorskip("matplotlib") and pytest.importorskip("sb3_reinforce.diagnostics.plots")

@@ -6,10 +6,10 @@ import sys
 import numpy as np
 import pytest
 import torch as th
+from callbacks import Record
 from environments import Corridor, Tree
 from gymnasium import spaces
-from stable_baselines3 import A2C
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -79,64 +79,26 @@ def test_a_model_is_as_it_was_and_goes_on(measure):
     assert starts_with_an_episode(model.rollout)
 
 
-class Measuring(BaseCallback):
-    """Measures a model where ``learn`` calls one of its methods, in the second rollout."""
-
-    def __init__(self, where, measure):
-        super().__init__()
-        self.where, self.measure = where, measure
-
-    def at(self, where):
-        if where == self.where and self.num_timesteps >= 16:
-            self.measure(self.model)
-        return True
-
-    def _on_rollout_start(self):
-        self.at("on_rollout_start")
-
-    def _on_step(self):
-        return self.at("on_step")
-
-    def _on_rollout_end(self):
-        self.at("on_rollout_end")
+def measuring(measure, at):
+    """A callback that measures the model in the second rollout, or between it and the next."""
+    return Record(lambda model: measure(model) if model.num_timesteps >= 16 else None, at)
 
 
 @pytest.mark.parametrize("measure", lab().values(), ids=lab())
 def test_a_measurement_that_would_cut_a_rollout_is_refused(measure):
     model = REINFORCE("MlpPolicy", Corridor((7,)), n_steps=16, seed=0, device="cpu")
     with pytest.raises(ValueError, match="model is collecting a rollout"):
-        model.learn(48, Measuring("on_step", measure))
+        model.learn(48, measuring(measure, "step"))
     assert starts_with_an_episode(model.learn(16).rollout)
 
 
-@pytest.mark.parametrize("where", ["on_rollout_start", "on_rollout_end"])
+@pytest.mark.parametrize("where", ["rollout_start", "rollout_end"])
 @pytest.mark.parametrize("measure", lab().values(), ids=lab())
 def test_a_callback_may_measure_between_rollouts(where, measure):
     model = REINFORCE("MlpPolicy", Corridor((7,)), n_steps=16, seed=0, device="cpu")
-    rollout = model.learn(32 if where == "on_rollout_start" else 48, Measuring(where, measure)).rollout
+    rollout = model.learn(32 if where == "rollout_start" else 48, measuring(measure, where)).rollout
     assert starts_with_an_episode(rollout)
     assert rollout.timesteps.flatten().tolist() == [t % 7 for t in range(16)]
-
-
-class Interrupted(Corridor):
-    """Ctrl-C at the second step of an episode."""
-
-    is_armed = False
-
-    def step(self, action):
-        if self.is_armed and self.t == 1:
-            raise KeyboardInterrupt
-        return super().step(action)
-
-
-@pytest.mark.parametrize("measure", lab().values(), ids=lab())
-def test_after_ctrl_c_a_model_starts_with_an_episode(measure):
-    model = REINFORCE("MlpPolicy", Interrupted((7,)), n_steps=16, seed=0, device="cpu").learn(16)
-    model.env.envs[0].unwrapped.is_armed = True
-    with pytest.raises(KeyboardInterrupt):
-        measure(model)
-    model.env.envs[0].unwrapped.is_armed = False
-    assert starts_with_an_episode(model.learn(16, reset_num_timesteps=False).rollout)
 
 
 @pytest.mark.parametrize("measure", lab().values(), ids=lab())
@@ -161,18 +123,14 @@ def test_generators_of_gpus_go_on_after_a_measurement():
 def test_a_callback_survives_frozen_parameters(callback):
     """One of the actor's in the third rollout, all of them in the fifth, none from the seventh on."""
 
-    class Freezing(BaseCallback):
-        def _on_step(self):
-            return True
-
-        def _on_rollout_start(self):
-            n, policy = self.num_timesteps // 16, self.model.policy
-            policy.action_net.bias.requires_grad_(not 2 <= n < 6)
-            for module in (policy.action_net.weight, policy.mlp_extractor.policy_net):
-                module.requires_grad_(not 4 <= n < 6)
+    def freeze(model):
+        n, policy = model.num_timesteps // 16, model.policy
+        policy.action_net.bias.requires_grad_(not 2 <= n < 6)
+        for module in (policy.action_net.weight, policy.mlp_extractor.policy_net):
+            module.requires_grad_(not 4 <= n < 6)
 
     model = REINFORCE("MlpPolicy", Corridor((3, 7)), n_steps=16, seed=0, device="cpu")
-    model.learn(16 * 60, [Freezing(), callbacks[callback]()])
+    model.learn(16 * 60, [Record(freeze, "rollout_start"), callbacks[callback]()])
     assert model.num_timesteps == 16 * 60
 
 
@@ -184,16 +142,19 @@ def test_a_model_without_environments_is_refused(measure):
         measure(model)
 
 
-@pytest.mark.parametrize("name", ["check_gradient", "compare_baselines", "compare_estimators", "sample"])
-def test_other_models_are_refused(name):
-    with pytest.raises(TypeError, match="must be a REINFORCE"):
-        lab()[name](A2C("MlpPolicy", "CartPole-v1", device="cpu"))
+REFUSING = ("check_gradient", "compare_baselines", "compare_estimators", "sample")
+REFUSING_CALLBACKS = [lambda model, make=make: model.learn(10, make()) for make in callbacks.values()]
 
 
-@pytest.mark.parametrize("callback", callbacks)
-def test_callbacks_refuse_other_models(callback):
+@pytest.mark.parametrize("measure", [*(lab()[name] for name in REFUSING), *REFUSING_CALLBACKS])
+def test_other_models_are_refused(measure):
     with pytest.raises(TypeError, match="must be a REINFORCE"):
-        A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callbacks[callback]())
+        measure(A2C("MlpPolicy", "CartPole-v1", device="cpu"))
+
+
+def test_a_landscape_needs_an_actor_critic_policy():
+    with pytest.raises(TypeError, match="actor-critic policy"):
+        landscape(DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=10))
 
 
 def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
@@ -201,6 +162,77 @@ def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
     for measure in (compare_baselines, compare_estimators, lambda m: m.learn(64, GradientQualityCallback(1))):
         with pytest.raises(ValueError, match="use_sde=True and sde_sample_freq=-1"):
             measure(model)
+
+
+def called(name, value=0.5):
+    """A constant baseline of that name."""
+
+    def function(rollout):
+        return th.full_like(rollout.returns, value)
+
+    function.__name__ = name
+    return function
+
+
+def learn_with_quality(model, **kwargs):
+    model.learn(1, GradientQualityCallback(**kwargs))
+
+
+MISTAKES = {
+    compare_baselines: [
+        ({"n_episodes": 2}, "n_episodes must be at least 3, got 2"),
+        ({"n_episodes": 10.0}, "n_episodes must be an integer"),
+        ({"baselines": ("no_such_baseline",)}, r"baselines must be.*'time_mean'.*got 'no_such_baseline'"),
+        ({"baselines": 3}, "baselines must be a name or a callable, got 3"),
+        ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "two of its functions are named '<lambda>'"),
+        ({"baselines": called("none")}, "named 'none'"),
+        ({"baselines": called("floor")}, "a function named 'floor', which is the name of a row"),
+        ({"baselines": called("optimal")}, "a function named 'optimal', which is the name of a row"),
+        ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
+        ({"baselines": ("value",)}, "no critic.*'none'"),
+        ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
+        ({"n_resamples": 0}, "n_resamples"),
+        ({"confidence": 2.0}, "confidence"),
+    ],
+    compare_estimators: [
+        ({"n_episodes": 2}, "n_episodes must be at least 3"),
+        ({"n_estimates": 1}, "n_estimates must be at least 3"),
+        ({"estimators": ("backward",)}, r"estimators must be one of.*'backward'"),
+        ({"delta_std": 0.0}, "delta_std"),
+        ({"n_delta": 1}, "n_delta must be at least 2"),
+        ({"estimators": "backward"}, "estimators must be one of.*'backward'"),
+        ({"estimators": ()}, "estimators must be one of"),
+        ({"perturbation": "cube"}, "perturbation must be"),
+        ({"confidence": 95}, "confidence"),
+    ],
+    landscape: [
+        ({"extent": 0}, "extent"),
+        ({"n_points": 1}, "n_points"),
+        ({"n_episodes": 0}, "n_episodes"),
+        ({"directions": th.ones(2, 3)}, r"directions.*\(2, 4\).*\(2, 3\)"),
+        ({"gradients": {"g": th.zeros(4)}}, r"gradients\['g'\].*not zero"),
+        ({"gradients": {"g": [1.0, 2.0]}}, r"gradients\['g'\] must be a tensor, got \[1.0, 2.0\]"),
+        ({"gradients": th.ones(4)}, "gradients must be a dictionary.*Tensor"),
+        ({"directions": [1.0, 2.0]}, "directions must be a tensor"),
+    ],
+    check_gradient: [({"n_episodes": 1}, "n_episodes must be at least 2")],
+    learn_with_quality: [
+        ({"every": 0}, "every must be at least 1, got 0"),
+        ({"max_episodes": 1}, "max_episodes must be at least 2, got 1"),
+        ({"baselines": ("no_such_baseline",)}, "got 'no_such_baseline'"),
+        ({"baselines": ("value",)}, "no critic"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("measure", "kwargs", "message"), [(measure, *case) for measure, cases in MISTAKES.items() for case in cases]
+)
+def test_a_users_mistake_is_named_before_anything_is_sampled(measure, kwargs, message):
+    env = Corridor((1,), lambda t, action: pytest.fail("a step was taken"))
+    model = REINFORCE("MlpPolicy", env, baseline="none", policy_kwargs={"net_arch": []}, device="cpu")
+    with pytest.raises((ValueError, TypeError), match=message):
+        measure(model, **kwargs)
 
 
 def test_nothing_here_needs_the_extras():

@@ -62,6 +62,7 @@ narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
         ("rate_too_large", "learning rate, now 1", "CartPole-v1", 2000, {"learning_rate": 1.0}),
         ("unscaled_returns", "VecNormalize", rewarded((5,), lambda t, action: 5e3), 64, {}),
         ("too_few_episodes", "n_episodes", rewarded((4,), noise), 400, whole),
+        ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
         ("total_return", "reward_to_go=True", rewarded((4,)), 64, {**whole, "n_episodes": 4, "reward_to_go": False}),
         ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
         ("useless_critic", "n_critic_updates", rewarded((4,), noise), 8000, flat_critic),
@@ -79,18 +80,8 @@ def test_every_pitfall_has_a_task():
     assert tested == set(PITFALLS)
 
 
-HEALTHY = {
-    "kl": 0.01,
-    "entropy": 0.6,
-    "std": 0.5,
-    "grad_norm": 1.0,
-    "explained_variance": 0.5,
-    "return_scale": 10.0,
-    "return_std": 5.0,
-    "n_episodes": 16,
-    "n_steps": 256,
-    "used_fraction": 1.0,
-}
+HEALTHY = dict(kl=0.01, entropy=0.6, std=0.5, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
+HEALTHY |= dict(n_episodes=16, n_steps=256, used_fraction=1.0)
 
 
 def seen(*updates, n=1, progress=1.0, signal=0.0, **kwargs):
@@ -165,11 +156,6 @@ def test_a_falling_temperature_is_not_blamed_on_the_learning_rate():
     assert "temperature (now 0.0" in found["deterministic_too_early"]
 
 
-def test_batches_as_small_as_in_a2c_are_found():
-    found = fall("CartPole-v1", 2000, n_envs=4, n_steps=5)
-    assert "n_steps, or the number of environments" in found["too_few_episodes"]
-
-
 def test_small_noise_weights_are_not_a_deterministic_policy():
     """With gSDE the standard deviation of an action is the one of the weights times the norm of the features."""
     gsde = {"use_sde": True, "normalize_advantage": True}
@@ -213,15 +199,12 @@ def healthy(env, timesteps, normalize=False, **kwargs):
     return callback.found, callback.n_updates - model.num_timesteps // (32 * 8)
 
 
-def test_nothing_is_said_of_a_healthy_run():
-    assert healthy("CartPole-v1", 15_000) == ({}, 0)
-    assert healthy("Pendulum-v1", 15_000, normalize=True, gamma=0.9) == ({}, 0)
-
-
-@pytest.mark.slow
-def test_nothing_is_said_of_long_healthy_runs():
-    assert healthy("CartPole-v1", 60_000) == ({}, 0)
-    assert healthy("Pendulum-v1", 100_000, normalize=True, gamma=0.9) == ({}, 0)
+@pytest.mark.parametrize(
+    ("cartpole", "pendulum"), [(15_000, 15_000), pytest.param(60_000, 100_000, marks=pytest.mark.slow)]
+)
+def test_nothing_is_said_of_a_healthy_run(cartpole, pendulum):
+    assert healthy("CartPole-v1", cartpole) == ({}, 0)
+    assert healthy("Pendulum-v1", pendulum, normalize=True, gamma=0.9) == ({}, 0)
 
 
 @pytest.mark.slow

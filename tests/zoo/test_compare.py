@@ -11,16 +11,12 @@ from unittest import mock
 
 import pytest
 
-pytest.importorskip("rl_zoo3")
 pandas = pytest.importorskip("pandas")
 
 import yaml
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
 
 from sb3_reinforce.zoo import HYPERPARAMS, experiments
-
-# The Zoo and its dependencies emit warnings of their own
-pytestmark = pytest.mark.filterwarnings("ignore")
 
 BENCHMARKS = Path(__file__).parents[2] / "examples" / "benchmarks"
 sys.path.append(str(BENCHMARKS))

@@ -2,13 +2,9 @@
 
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("rl_zoo3")
-pytest.importorskip("matplotlib")
-
 import gymnasium as gym
 import optuna
+import pytest
 import rl_zoo3
 import torch as th
 import yaml
@@ -19,8 +15,6 @@ from zoo_commands import RUN, config_of, message_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
-# The Zoo and its dependencies emit warnings of their own
-pytestmark = pytest.mark.filterwarnings("ignore")
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
     "finite_difference": {"learning_rate", "delta_std"},

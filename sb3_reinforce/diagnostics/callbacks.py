@@ -1,0 +1,241 @@
+"""Callbacks that watch the gradient while a model trains: how noisy it is, and which pitfalls it has fallen into."""
+
+import math
+import warnings
+from collections import deque
+from collections.abc import Iterable
+from typing import Any, cast
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, std_of, temperature_of
+from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
+from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
+from sb3_reinforce.estimation.baselines import Baseline
+from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.scores import scored_parameters
+from sb3_reinforce.finite_difference import FiniteDifference
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature
+from sb3_reinforce.reinforce import REINFORCE
+
+
+class Diagnosis(BaseCallback):
+    """Keeps what it knows of a model from one ``learn()`` to the next, but not for another model."""
+
+    def __init__(self, verbose: int = 0):
+        super().__init__(verbose)
+        self.last_model: Any = None
+        self.forget()
+
+    def _init_callback(self) -> None:
+        if self.model is not self.last_model:
+            self.last_model = self.model
+            self.forget()
+
+    def forget(self) -> None:
+        """Start with a model of which nothing is known."""
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class GradientQualityCallback(Diagnosis):
+    """
+    Logs how noisy the gradient is, computed from the rollouts of the training itself.
+
+    Every ``every`` rollouts:
+
+    - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient, with the weights of
+      training;
+    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, the number of episodes with a signal-to-noise ratio of 1;
+    - ``gradient/variance/<baseline>``: tr Σ of one episode for each of ``baselines``, computed from these episodes;
+    - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
+
+    A FiniteDifference has only the cosine, as its episodes have no gradients of their own. It logs the quality of its
+    estimate itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
+
+    A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
+    rollout and are noisy if it has few episodes; with fewer than two, or while the actor is frozen, nothing is logged.
+    A measurement costs about one forward and 1 + (number of baselines) backward passes over at most ``max_episodes``
+    episodes, two more with ``"optimal"``, and as much again for each 256 MiB of their gradients. Nothing is sampled for
+    it, and training is the same with and without it.
+
+    :param every: Rollouts between two measurements
+    :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
+    :param max_episodes: Largest number of episodes of a rollout that are used
+    :param verbose: Verbosity level
+    :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
+    :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
+        lacks, or if the model's episodes are not independent because they share the noise of gSDE
+    """
+
+    def __init__(
+        self,
+        every: int = 10,
+        baselines: Iterable[str | Baseline] = ("none", "time_mean"),
+        max_episodes: int = 64,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        self.every = check_integer("every", every, 1)
+        self.max_episodes = check_integer("max_episodes", max_episodes, 2)
+        self.baselines = baselines
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        if not isinstance(self.model, FiniteDifference):
+            check_model(self.model, independent=True)
+            self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
+
+    def forget(self) -> None:
+        """Start with a model of which nothing is known."""
+        self.n_rollouts = 0
+        self.thetas: list[th.Tensor] = []
+
+    def _on_rollout_end(self) -> None:
+        self.n_rollouts += 1
+        n_left = -self.n_rollouts % self.every
+        if n_left > 2:
+            # A cosine needs the parameters before the last three updates
+            return
+        figures: dict[str, float] = {}
+        if isinstance(self.model, FiniteDifference):
+            theta = self.model.theta
+        else:
+            rollout = cast(Rollout, cast(REINFORCE, self.model).rollout)
+            try:
+                theta = to_vector(scored_parameters(rollout))
+            except ValueError:
+                # The actor is frozen
+                return
+            figures = {} if n_left else self.measure(rollout)
+        if self.thetas and self.thetas[-1].shape != theta.shape:
+            self.thetas = []
+        self.thetas = [*self.thetas[-2:], theta]
+        if len(self.thetas) == 3:
+            before, after = th.stack(self.thetas).diff(dim=0)
+            figures["cosine"] = float(th.cosine_similarity(before, after, dim=0))
+        if n_left == 0:
+            for key, figure in figures.items():
+                self.logger.record(f"gradient/{key}", figure)
+
+    def measure(self, rollout: Rollout) -> dict[str, float]:
+        """The figures of one rollout, before training on it."""
+        n_episodes = len(th.unique(rollout.episodes[rollout.used]))
+        if n_episodes < 2:
+            return {}
+        own_weights = training_weights(cast(REINFORCE, self.model))
+        rollout = evenly_spread(rollout, self.max_episodes)
+        weights = [own_weights, *(weights_by(function, rollout) for function in self.functions.values())]
+        grams = sum(th.stack([gram(g) for g in block]) for block in gradient_blocks(rollout, *weights))
+        every_episode = th.ones(1, min(n_episodes, self.max_episodes), dtype=th.float64)
+        own, *others = (compute_moments(each, every_episode) for each in cast(th.Tensor, grams))
+        figures = {"snr": n_episodes * float(signal_to_noise(own)), "noise_scale": float(noise_scale(own))}
+        for name, moments in zip(self.functions, others, strict=True):
+            figures[f"variance/{name}"] = float(variance(moments))
+        return figures
+
+
+class PitfallCallback(Diagnosis):
+    """
+    Warns once about each of eight known pitfalls of the policy gradient, and names the argument to change.
+
+    Of several pitfalls with one cause only the cause is reported.
+
+    The pitfalls are those of ``pitfalls.PITFALLS``: a learning rate that is too large, returns that are not scaled, too
+    few episodes, the total return, gradients that spike without clipping, a critic that explains nothing, a policy that
+    is deterministic too early, and episodes that are cut. They are detected from what training computes anyway; the
+    cost is three forward passes and a backward pass over at most 256 steps of a rollout. Training is not changed.
+
+    A FiniteDifference is refused: it has no returns that weight scores.
+
+    :param verbose: Verbosity level
+    :raises TypeError: If the model is not a REINFORCE
+    """
+
+    # Steps behind a KL divergence, and components of a gradient that are kept
+    N_STEPS = 256
+    N_COMPONENTS = 10_000
+
+    def _init_callback(self) -> None:
+        check_model(self.model)
+        super()._init_callback()
+
+    def forget(self) -> None:
+        """Start with a model of which nothing is known."""
+        self.found: dict[str, str] = {}
+        self.updates: deque[Update] = deque(maxlen=50)
+        self.n_updates = 0
+        self.rollout: Rollout | None = None
+
+    def _on_training_start(self) -> None:
+        self.total_timesteps: int = self.locals["total_timesteps"]
+
+    def _on_rollout_end(self) -> None:
+        model = cast(REINFORCE, self.model)
+        rollout = self.rollout = cast(Rollout, model.rollout)
+        policy = rollout.policy
+        is_first = rollout.used & (rollout.used.flatten().cumsum(0).view_as(rollout.used) <= self.N_STEPS)
+        self.obs = select(rollout.observations, is_first)
+        self.actions = as_policy_actions(select(rollout.actions, is_first), model.action_space)
+        self.temperature = temperature_of(policy)
+        log_prob, _ = log_prob_and_entropy(policy, self.obs, self.actions)
+        self.log_prob = log_prob.detach()
+        self.gradient = th.zeros(0)
+        if log_prob.requires_grad:
+            parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+            weights = select(training_weights(model), is_first).to(log_prob)
+            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
+            self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
+
+    def _on_rollout_start(self) -> None:
+        self.examine()
+
+    def _on_training_end(self) -> None:
+        self.examine()
+
+    def examine(self) -> None:
+        """Add the update after the last rollout to the history, and warn of new pitfalls."""
+        if self.rollout is None or not self.logger.name_to_value:
+            return
+        self.updates.append(self.update(self.rollout))
+        self.n_updates += 1
+        self.rollout = None
+        progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.total_timesteps)
+        history = History(cast(REINFORCE, self.model), list(self.updates), self.n_updates, progress_remaining)
+        for name, pitfall in PITFALLS.items():
+            is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
+            sentence = None if name in self.found or is_explained else pitfall(history)
+            if sentence is not None:
+                self.found[name] = sentence
+                warnings.warn(sentence, stacklevel=2)
+
+    @th.no_grad()
+    def update(self, rollout: Rollout) -> Update:
+        """What is known of the last update, which was computed from this rollout."""
+        logged = self.logger.name_to_value
+        returns = rollout.returns[rollout.used]
+        present = temperature_of(rollout.policy)
+        # A falling temperature changes log π too, whatever the step
+        set_temperature(rollout.policy, self.temperature)
+        log_prob, _ = log_prob_and_entropy(rollout.policy, self.obs, self.actions)
+        set_temperature(rollout.policy, present)
+        return Update(
+            kl=float((self.log_prob - log_prob).mean()),
+            entropy=-logged.get("train/entropy_loss", math.nan),
+            std=std_of(rollout.policy, self.obs),
+            grad_norm=logged.get("train/grad_norm", math.nan),
+            explained_variance=logged.get("train/explained_variance", math.nan),
+            gradient=self.gradient,
+            return_scale=float(returns.square().mean().sqrt()),
+            return_std=float(returns.std(correction=0)),
+            n_episodes=len(th.unique(rollout.episodes[rollout.used])),
+            n_steps=len(returns),
+            used_fraction=len(returns) / rollout.used.numel(),
+            temperature=self.temperature,
+        )
