@@ -30,6 +30,7 @@ class Rollout:
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``
     :param policy: The policy that acted, with the parameters with which it acted
     :param denominator: What the sum over all steps is divided by
+    :param next_values: V(s_{t+1}), which is 0 after a terminal state, float64; None without ``baseline="value"``
     :param state: The state of a recurrent policy before the first step, shape
         ``(n_envs, 2, 2, n_layers, n_hidden)`` for actor and critic, hidden and cell state; None if all start from zero
     """
@@ -45,6 +46,7 @@ class Rollout:
     values: th.Tensor | None
     policy: ActorCriticPolicy
     denominator: int
+    next_values: th.Tensor | None = None
     state: th.Tensor | None = None
 
     @property

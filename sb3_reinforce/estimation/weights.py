@@ -63,6 +63,7 @@ def complete_rollout(
         returns=th.tensor(returns),
         discounts=th.as_tensor(gamma**exponents),
         values=None if next_values is None else th.as_tensor(buffer.values).double(),
+        next_values=None if next_values is None else th.as_tensor(next_values).double(),
         policy=policy,
         denominator=denominator,
         state=state,

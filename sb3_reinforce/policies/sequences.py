@@ -207,6 +207,11 @@ def rows_of(obs: Any, dones: th.Tensor, state: th.Tensor | None) -> Rows:
     return rows
 
 
+def without_memory(rows: Rows) -> Rows:
+    """The rows, each as a sequence of one step."""
+    return {**rows, "sequence": th.arange(len(rows["sequence"]), device=rows["sequence"].device)}
+
+
 def sequence_minibatches(sequence: th.Tensor, size: int) -> Iterator[th.Tensor]:
     """Rows of whole sequences, drawn without replacement, about ``size`` at a time and at least one sequence."""
     _, number, lengths = th.unique(sequence, return_inverse=True, return_counts=True)

@@ -213,7 +213,7 @@ def test_the_lab_takes_it(network):
     model = make_recurrent(env=env, double=False, n_episodes=4, policy_kwargs=network)
     table = check_gradient(model)
     assert table.passed, str(table)
-    assert len(compare_baselines(model, n_batches=4, n_episodes=4)) >= 5
+    assert len(compare_baselines(model, n_episodes=4, n_resamples=50)) >= 5
     assert RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
 
 
