@@ -24,8 +24,7 @@ from sb3_reinforce.estimation.estimators import (
     Estimator,
     GradientEstimate,
     central_difference,
-    check_deltas,
-    check_estimate,
+    check_tensor,
     fit_quality,
 )
 from sb3_reinforce.estimation.perturbations import (
@@ -155,7 +154,6 @@ class FiniteDifference(BasePolicyGradient):
         self._generator: th.Generator | None = None
         self._trainable: list[th.nn.Parameter] = []
         self._searched: list[th.nn.Parameter] = []
-        self._warned = False
         if _init_setup_model:
             self._setup_model()
 
@@ -225,7 +223,13 @@ class FiniteDifference(BasePolicyGradient):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._warn_of_few_perturbations()
+        n = self.n_parameters
+        if self.estimator == "regression" and cast(int, self.n_delta) <= n:
+            warnings.warn(
+                f"n_delta={self.n_delta} perturbations do not determine the gradient of {n} parameters and an "
+                "intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
+                stacklevel=3,
+            )
         callback.on_training_start(locals(), globals())
         iteration = 0
         while self.num_timesteps < total_timesteps:
@@ -240,18 +244,6 @@ class FiniteDifference(BasePolicyGradient):
                 self.dump_logs(iteration)
         callback.on_training_end()
         return self
-
-    def _warn_of_few_perturbations(self) -> None:
-        """Warn once if a regression has more unknowns than perturbations."""
-        n = self.n_parameters
-        n_delta = cast(int, self.n_delta)
-        if self.estimator == "regression" and n_delta <= n and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"n_delta={n_delta} perturbations do not determine the gradient of {n} parameters and an intercept: "
-                "the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
-                stacklevel=4,
-            )
 
     def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate:
         """
@@ -272,14 +264,14 @@ class FiniteDifference(BasePolicyGradient):
             generator = cast(th.Generator, self._generator)
             delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
             directions = self._function("perturbation", PERTURBATIONS)(n_delta, n, generator)
-            deltas = delta_std * check_deltas(directions, n_delta, n)
+            deltas = delta_std * check_tensor("perturbation", directions, (n_delta, n))
             estimator = self._function("estimator", ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
             with episodic_utility(self, searched, callback, first_seed) as utility:
-                gradient = check_estimate(estimator(utility, theta, deltas), n)
+                gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:

@@ -71,12 +71,16 @@ class RecurrentREINFORCE(REINFORCE):
             n_episodes = 16
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
-        if isinstance(policy, type) and not issubclass(policy, RecurrentPolicy):
+        super().__init__(policy, env, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs)
+
+    def _check_policy(self, policy: str | type) -> None:
+        if isinstance(policy, str):
+            super()._check_policy(policy)
+        elif not issubclass(policy, RecurrentPolicy):
             raise ValueError(
                 f"policy must be one of {', '.join(self.policy_aliases)} of sb3_reinforce.recurrent or a subclass, got "
-                f"{policy.__name__}: REINFORCE trains policies without a memory"
+                f"{policy.__name__}"
             )
-        super().__init__(policy, env, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         # The environments are reset after loading

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE, FiniteDifference
@@ -15,6 +17,8 @@ KINDS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any]]] = {
     "episodes": (REINFORCE, {"n_episodes": 2, "baseline": "none"}),
     "search": (FiniteDifference, {"n_delta": 2, "estimator": "central", "common_random_numbers": False}),
 }
+all_kinds = pytest.mark.parametrize("kind", KINDS)
+both = pytest.mark.parametrize("kind", ["steps", "search"])
 
 
 def make(kind: str, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:
@@ -38,6 +42,13 @@ def moved_by_learning(model: Any, total_timesteps: int) -> set[str]:
     before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
     model.learn(total_timesteps)
     return {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
+
+
+class OwnPrediction(ActorCriticPolicy):
+    """Code of the user's, which only the policy itself can run."""
+
+    def _predict(self, observation, deterministic=False):  # type: ignore[no-untyped-def]
+        return super()._predict(observation, deterministic)
 
 
 class Scaled(FlattenExtractor):

@@ -13,12 +13,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
+from sb3_reinforce.common import storage
 from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
-from sb3_reinforce.common.states import check_finite, generator_states, optimizer_mismatch, restore_generators
-from sb3_reinforce.common.storage import PathOrFile, check_archive, write_whole
 
 __all__ = ["BasePolicyGradient", "uninterrupted"]
 
@@ -31,15 +30,13 @@ STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
 
 class BasePolicyGradient(BaseAlgorithm):
-    """
-    What both algorithms have in common besides the mathematics: saving and loading change everything or nothing.
+    """What both algorithms have in common besides the mathematics: saving and loading change everything or nothing."""
 
-    ``_arguments`` are the checks of the constructor's arguments, which also build the schedules; ``_own_argument`` is
-    one that no other algorithm saves; ``_instead`` says for arguments of other algorithms what to use.
-    """
-
+    # The checks of the constructor's arguments, which also build the schedules
     _arguments: ClassVar[Mapping[str, Check]]
+    # One that no other algorithm saves
     _own_argument: ClassVar[str]
+    # What to use for arguments of other algorithms
     _instead: ClassVar[Mapping[str, str]] = {}
     _random_state: bytes
 
@@ -55,13 +52,16 @@ class BasePolicyGradient(BaseAlgorithm):
         # Stable-Baselines3 uses some arguments as soon as it has them
         for name in kwargs.keys() & self._arguments.keys():
             self._arguments[name](name, kwargs[name])
-        check_policy_name(policy, self.policy_aliases)
+        self._check_policy(policy)
         if needs_env or env is not None:
             env = check_env(env, verbose)
         # A copy: Stable-Baselines3 writes to it
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)
+
+    def _check_policy(self, policy: str | type) -> None:
+        check_policy_name(policy, self.policy_aliases)
 
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = self._schedule("learning_rate")
@@ -108,7 +108,7 @@ class BasePolicyGradient(BaseAlgorithm):
         return shift_to_start(self.action_space, actions), state
 
     def save(
-        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+        self, path: storage.PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
     ) -> None:
         """
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
@@ -118,15 +118,15 @@ class BasePolicyGradient(BaseAlgorithm):
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written
         """
-        self._random_state = generator_states(self.device)
+        self._random_state = storage.generator_states(self.device)
         buffer = BytesIO()
         super().save(buffer, exclude, include)
-        write_whole(path, buffer.getvalue())
+        storage.write_whole(path, buffer.getvalue())
 
     @classmethod
     def load(
         cls: type[Model],
-        path: PathOrFile,
+        path: storage.PathOrFile,
         env: GymEnv | None = None,
         *args: Any,
         restore_random_state: bool = False,
@@ -149,7 +149,7 @@ class BasePolicyGradient(BaseAlgorithm):
         :raises ValueError: If an argument is out of its range, or the file is damaged or has no random state
         """
         check_flag("restore_random_state", restore_random_state)
-        saved = check_archive(path, ("data", "policy.pth"))
+        saved = storage.check_archive(path, ("data", "policy.pth"))
         if cls._own_argument not in saved:
             raise ValueError(
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
@@ -167,7 +167,7 @@ class BasePolicyGradient(BaseAlgorithm):
             env = check_env(env, verbose=0)
         model = super().load(path, env, *args, **kwargs)
         if restore_random_state:
-            restore_generators(model._random_state, model.device)
+            storage.restore_generators(model._random_state, model.device)
         elif kwargs.get("seed") is not None:
             # A generator that was saved continues from the seed before
             model.set_random_seed(model.seed)
@@ -185,7 +185,10 @@ class BasePolicyGradient(BaseAlgorithm):
         super().set_env(check_env(env, self.verbose, self.n_envs), force_reset)
 
     def set_parameters(
-        self, load_path_or_dict: PathOrFile | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+        self,
+        load_path_or_dict: storage.PathOrFile | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
     ) -> None:
         """
         Take parameters from a file or dictionary, which may be those of another algorithm with the same policy class:
@@ -205,7 +208,7 @@ class BasePolicyGradient(BaseAlgorithm):
         """
         states = load_path_or_dict
         if not isinstance(states, dict):
-            check_archive(states, ("policy.pth",))
+            storage.check_archive(states, ("policy.pth",))
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
         names = self._get_torch_save_params()[0]
         allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
@@ -219,7 +222,7 @@ class BasePolicyGradient(BaseAlgorithm):
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
         # A mask that a user's policy adds to its logits may well be infinite
-        check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
+        storage.check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
         try:
             # The policy comes first, and with it a mismatch that is named by its parameters
@@ -235,7 +238,7 @@ class BasePolicyGradient(BaseAlgorithm):
         if isinstance(part, th.nn.Module):
             part.load_state_dict(state, strict=exact_match)
             return
-        reason = optimizer_mismatch(part, state)
+        reason = storage.optimizer_mismatch(part, state)
         needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
         if reason and exact_match:
             raise ValueError(f"{needed}, but {reason}")

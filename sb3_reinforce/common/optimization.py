@@ -16,12 +16,7 @@ def step(
     max_grad_norm: float | None,
     name: str,
 ) -> float:
-    """
-    Clip the gradients of a loss to a common norm and descend along them; return the norm before clipping.
-
-    Other parameters that the optimizer holds keep their values. If the norm is not finite, a ValueError is raised and
-    nothing changes.
-    """
+    """Clip the gradients of a loss to a common norm, descend along them, and return the norm before clipping."""
     norm = float(th.linalg.vector_norm(to_vector(gradients)))
     if not math.isfinite(norm):
         raise ValueError(
@@ -31,25 +26,16 @@ def step(
     scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
     optimizer.zero_grad()
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = None if gradient is None else like(parameter, gradient if scale == 1 else gradient * scale)
+        # In the memory layout of its parameter, which a fused optimizer takes for granted
+        parameter.grad = None if gradient is None else th.mul(gradient, scale, out=th.empty_like(parameter))
     optimizer.step()
     return norm
 
 
-def like(parameter: th.nn.Parameter, gradient: th.Tensor) -> th.Tensor:
-    """The gradient in the memory layout of its parameter, which a fused optimizer takes for granted."""
-    if gradient.stride() == parameter.stride() and gradient.dtype == parameter.dtype:
-        return gradient
-    return th.empty_like(parameter).copy_(gradient)
-
-
 @contextmanager
 def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
-    """
-    Roll the parameters back if any of them is non-finite when the block ends, and clear the optimizer's state.
-
-    A finite gradient can do that: Adam without its ``eps`` divides 0 by 0, and weight decay may be too large.
-    """
+    """Roll the parameters back if any of them is not finite when the block ends, and clear the optimizer's state."""
+    # Finite gradients can do that: Adam without its eps divides 0 by 0, and weight decay may be too large
     before = to_vector(parameters)
     try:
         yield

@@ -151,20 +151,14 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         model.n_steps = 32 if model.has_critic else None
         model.n_episodes = None if model.has_critic else 16
     if model.n_steps is not None and model.n_episodes is not None:
-        raise ValueError(
-            f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r} are both given: a rollout is either a "
-            "number of steps or a number of whole episodes, so set one of them to None"
-        )
+        given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
+        raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
     if model.n_episodes == 1 and model.baseline in ("leave_one_out", "optimal"):
-        raise ValueError(
-            f"n_episodes must be at least 2 with baseline={model.baseline!r}, which is computed from the other "
-            "episodes of the rollout, got 1"
-        )
+        reason = f"baseline={model.baseline!r}, which is computed from the other episodes"
+        raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
-        raise ValueError(
-            f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got "
-            f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
-        )
+        got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
+        raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
     if isinstance(model.action_space, spaces.Box):
         if model.temperature != 1:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")

@@ -11,23 +11,6 @@ class BadData(ValueError):
     """What an environment returned at this step cannot be learned from."""
 
 
-def is_finite(values: np.ndarray) -> np.ndarray:
-    """Which numbers are finite in float32, in which they are learned from; any shape."""
-    with np.errstate(over="ignore"):
-        return np.isfinite(values.astype(np.float32))
-
-
-def all_finite(values: np.ndarray) -> bool:
-    """Whether all numbers of an array are finite in float32."""
-    # One product costs less than isfinite and all; where it is large, they decide
-    return values.dtype.kind != "f" or float(np.vdot(values, values)) < 1e76 or bool(is_finite(values).all())
-
-
-def format_number(value: Any) -> str:
-    """A number that is not finite in float32, for a message."""
-    return f"{value} (float32 ends at 3.4e38)" if np.isfinite(value).all() else str(value)
-
-
 def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
     """Check numbers (n_steps, n_envs, ...) less the leading indices in ``where``; the step None is the present one."""
     if isinstance(values, dict):
@@ -35,15 +18,22 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
             check_finite(f"{name} {key!r}", part, where)
         return
     values = np.asarray(values)
-    if all_finite(values):
+    # One product costs less than isfinite and all; where it is large, they decide
+    if values.dtype.kind != "f" or float(np.vdot(values, values)) < 1e76:
         return
-    first = tuple(int(i) for i in np.argwhere(~is_finite(values))[0])
+    # Numbers are learned from in float32
+    with np.errstate(over="ignore"):
+        bad = np.argwhere(~np.isfinite(values.astype(np.float32)))
+    if not len(bad):
+        return
+    first = tuple(bad[0].tolist())
     step, env = (*where, *first)[:2]
+    number = values[first]
+    reason = f"is not finite: {number}{' (float32 ends at 3.4e38)' if np.isfinite(number) else ''}"
     if step is None:
-        raise BadData(f"{name} of environment {env} is not finite: {format_number(values[first])}")
+        raise BadData(f"{name} of environment {env} {reason}")
     raise ValueError(
-        f"{name} of environment {env} at step {step} of the rollout is not finite: {format_number(values[first])}. "
-        "The policy has not been updated with this rollout."
+        f"{name} of environment {env} at step {step} of the rollout {reason}. The policy has not been updated with it."
     )
 
 
@@ -55,12 +45,7 @@ def as_reward(reward: Any, env: int) -> float:
     return float(values.item())
 
 
-def has_form(space: spaces.Space[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    """Whether an array may be an observation: integers may stand for real numbers, but not fractions for integers."""
-    return shape == space.shape and dtype.kind in ("biuf" if np.dtype(space.dtype).kind == "f" else "biu")
-
-
-def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
+def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
     """Check the form of one observation, which a VecEnv would silently broadcast, cut or round to its space."""
     if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == space.shape and type(space) is spaces.Box:
         return
@@ -77,7 +62,9 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: int) -> None:
         values = np.asarray(obs)
     except ValueError as error:
         raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
-    if not has_form(space, values.shape, values.dtype):
+    # Integers may stand for real numbers, but not fractions for integers
+    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
+    if values.shape != space.shape or values.dtype.kind not in kinds:
         raise BadData(
             f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
             f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"

@@ -1,18 +1,16 @@
 """
 Guards of the environments while a model learns: a fault is named where it enters, before it does harm.
 
-``step_wait`` and ``reset`` are replaced on the instances: of the innermost ``DummyVecEnv``, to check the form of what
-its environments return, and of what lies right below each ``VecNormalize``, to check that numbers are finite before its
-statistics take them in. What a subclass of ``DummyVecEnv`` returns is not checked for its form.
+``step_wait`` and ``reset`` are replaced on two instances: the innermost ``DummyVecEnv``, but no subclass, to check the
+form of observations; and what lies right below each ``VecNormalize``, to check that numbers are finite.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -21,18 +19,14 @@ from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
 from sb3_reinforce.envs.workers import watch
 
-Model = TypeVar("Model", bound=BaseAlgorithm)
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 
-def guarded(
-    learn: Callable[Concatenate[Model, Arguments], Result],
-) -> Callable[Concatenate[Model, Arguments], Result]:
+def guarded(learn: Learn) -> Learn:
     """``learn`` with its model's environments guarded, and with SIGTERM ending it as Ctrl-C does."""
 
     @wraps(learn)
-    def run(model: Model, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:
         with interruptible(), guard(model.env):
             try:
                 return learn(model, *args, **kwargs)
@@ -42,7 +36,7 @@ def guarded(
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
 
-    return run
+    return cast(Learn, run)
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from copy import deepcopy
 from traceback import walk_tb
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
@@ -23,12 +22,10 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
-    # One array, unless observations are dicts
-    rows: Any = env.buf_obs.get(None)  # type: ignore[call-overload]
-    # The usual observation is written at once; to compare two shapes takes as long as all else here
-    is_vector = isinstance(env.observation_space, spaces.Box) and rows.ndim == 2
-    dtype = rows.dtype if is_vector else None
-    size = rows.shape[1] if is_vector else 0
+    # The usual observation is written at once
+    is_box = isinstance(env.observation_space, spaces.Box)
+    rows: Any = env.buf_obs[None] if is_box else np.empty(0)  # type: ignore[index]
+    form = (rows.dtype, rows.shape[1:])
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         try:
@@ -44,16 +41,13 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if type(obs) is np.ndarray and obs.dtype is dtype and obs.ndim == 1 and len(obs) == size:
+        if is_box and type(obs) is np.ndarray and (obs.dtype, obs.shape) == form:
             rows[i] = obs
         else:
-            check_observation(env.observation_space, obs, i)
-            for key, part in env.buf_obs.items():
-                part[i] = obs if key is None else obs[key]
+            write(env, i, obs)
         infos.append(info)
     env.buf_infos = infos
-    observations = {key: part.copy() for key, part in env.buf_obs.items()} if rows is None else rows.copy()
-    return observations, rewards.copy(), dones.copy(), infos.copy()
+    return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
 
 
 def check_monitor(error: Exception, i: int) -> None:
@@ -64,26 +58,25 @@ def check_monitor(error: Exception, i: int) -> None:
         raise BadData(f"The reward of environment {i} must be a number, got {reward!r}: {error}") from error
 
 
-class CheckedReset(gym.Wrapper[Any, Any, Any, Any]):
-    """Environment ``i`` of a VecEnv, with a check of its first observation."""
-
-    def __init__(self, env: gym.Env[Any, Any], i: int, space: spaces.Space[Any]):
-        super().__init__(env)
-        self.i = i
-        self.space = space
-
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """What the environment's reset returns."""
-        obs, info = self.env.reset(**kwargs)
-        check_observation(self.space, obs, self.i)
-        return obs, info
-
-
 def reset(env: DummyVecEnv) -> VecEnvObs:
     """What ``env.reset()`` returns."""
-    envs = env.envs
-    env.envs = [CheckedReset(single, i, env.observation_space) for i, single in enumerate(envs)]
-    try:
-        return DummyVecEnv.reset(env)
-    finally:
-        env.envs = envs
+    for i, single in enumerate(env.envs):
+        options = {"options": env._options[i]} if env._options[i] else {}
+        obs, env.reset_infos[i] = single.reset(seed=env._seeds[i], **options)
+        write(env, i, obs)
+    env._reset_seeds()
+    env._reset_options()
+    return copy_observations(env)
+
+
+def write(env: DummyVecEnv, i: int, obs: Any) -> None:
+    """Check the observation of environment ``i`` and write it into the buffers."""
+    check_observation(env.observation_space, obs, i)
+    for key, part in env.buf_obs.items():
+        part[i] = obs if key is None else obs[key]
+
+
+def copy_observations(env: DummyVecEnv) -> VecEnvObs:
+    """All observations, ``(n_envs, ...)`` or a dict of them, which the next step does not change."""
+    copies: Any = {key: part.copy() for key, part in env.buf_obs.items()}
+    return copies.get(None, copies)  # type: ignore[no-any-return]

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.envs.checks import BadData, check_observation, has_form
+from sb3_reinforce.common.tensors import take
+from sb3_reinforce.envs.checks import BadData, check_observation
 
 Restart: TypeAlias = Callable[[Any, NDArray[np.bool_]], Any]
 
@@ -35,7 +36,8 @@ class GymnasiumVecEnv(VecEnv):
     :param env: A vector environment with ``autoreset_mode`` ``SAME_STEP`` or ``DISABLED``, or Gymnasium's vectorized
         CartPole, which is then reset within the step
     :raises TypeError: If ``env`` is not a ``gymnasium.vector.VectorEnv``
-    :raises ValueError: If it resets its copies in place of the next step (``NEXT_STEP``)
+    :raises ValueError: If it resets its copies in place of the next step (``NEXT_STEP``), or is ``DISABLED`` below
+        Gymnasium's ``RecordEpisodeStatistics``, which then forgets the episodes that go on when others end
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]):
@@ -65,7 +67,10 @@ class GymnasiumVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step; malformed observations and rewards are refused."""
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
-        check_batch(self.observation_space, obs, rewards, self.num_envs)
+        rewards = np.asarray(rewards)
+        if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
+            raise BadData(f"The rewards must be {self.num_envs} numbers, one an environment, got {rewards.tolist()}")
+        check_batch(self.observation_space, obs, self.num_envs)
         dones = terminated | truncated
         ended = np.flatnonzero(dones).tolist()
         if self.restart is None and ended and "final_obs" not in env_infos:
@@ -85,8 +90,8 @@ class GymnasiumVecEnv(VecEnv):
             episodes = {key: values for key, values in env_infos.items() if key in ("episode", "_episode")}
             for i in ended:
                 infos[i] |= info_of(episodes, i)
-                check_observation(self.observation_space, one_of(last_obs, i), i)
-                infos[i]["terminal_observation"] = copy(one_of(last_obs, i))
+                check_observation(self.observation_space, take(last_obs, i), i)
+                infos[i]["terminal_observation"] = copy(take(last_obs, i))
             obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
@@ -149,6 +154,11 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
     if mode is AutoresetMode.SAME_STEP:
         return None
     if mode is AutoresetMode.DISABLED:
+        wrapper = env
+        while isinstance(wrapper, VectorWrapper):
+            if isinstance(wrapper, RecordEpisodeStatistics):
+                raise ValueError(f"{env} would forget the episodes that go on when others end: use VecMonitor instead")
+            wrapper = wrapper.env
         return restart_by_mask
     if type(env) is CartPoleVectorEnv:
         return restart_cart_pole
@@ -161,18 +171,7 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
 
 def restart_by_mask(env: VectorEnv[Any, Any, Any], ended: NDArray[np.bool_]) -> Any:
     """Start new episodes where ``ended`` (n_envs,) by Gymnasium's ``reset_mask``."""
-    # The environment removes the mask from the options, after which this wrapper would clear the counts of all copies
-    counts = []
-    wrapper = env
-    while isinstance(wrapper, VectorWrapper):
-        if isinstance(wrapper, RecordEpisodeStatistics):
-            for name in ("episode_start_times", "episode_returns", "episode_lengths", "prev_dones"):
-                counts.append((wrapper, name, getattr(wrapper, name)))
-        wrapper = wrapper.env
-    obs_and_infos = env.reset(options={"reset_mask": ended})
-    for recorder, name, before in counts:
-        getattr(recorder, name)[~ended] = before[~ended]
-    return obs_and_infos
+    return env.reset(options={"reset_mask": ended})
 
 
 def restart_cart_pole(env: Any, ended: NDArray[np.bool_]) -> Any:
@@ -188,32 +187,21 @@ def reset_copies(env: AsyncVectorEnv, wanted: list[int], seed: int | None = None
     mask = np.isin(np.arange(env.num_envs), wanted)
     seeds = [seed if is_wanted else None for is_wanted in mask]
     obs, infos = env.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
-    return [(one_of(obs, i), info_of(infos, i)) for i in wanted]
+    return [(take(obs, i), info_of(infos, i)) for i in wanted]
 
 
-def check_batch(space: spaces.Space[Any], obs: Any, rewards: Any, n_envs: int) -> None:
-    """Check the form of the observations (n_envs, ...), or a dict of them, and the rewards (n_envs,) of a step."""
-    rewards = np.asarray(rewards)
-    if rewards.shape != (n_envs,) or rewards.dtype.kind not in "biuf":
-        got = f"shape {rewards.shape} and dtype {rewards.dtype}"
-        raise BadData(f"The rewards must be {n_envs} numbers, one for each environment, got {got}")
-    parts = {key: np.asarray(part) for key, part in obs.items()} if isinstance(obs, dict) else {"": np.asarray(obs)}
-    spaces_of = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    for part in parts.values():
-        if part.shape[:1] != (n_envs,):
-            raise BadData(f"The observations must be those of {n_envs} environments, got shape {part.shape}")
-    is_checked = parts.keys() >= spaces_of.keys() and all(
-        type(each) is spaces.Box and has_form(each, parts[key].shape[1:], parts[key].dtype)
-        for key, each in spaces_of.items()
-    )
-    if not is_checked:
-        for i in range(n_envs):
-            check_observation(space, one_of(obs, i), i)
-
-
-def one_of(obs: Any, i: int) -> Any:
-    """The observation of copy ``i``."""
-    return {key: part[i] for key, part in obs.items()} if isinstance(obs, dict) else obs[i]
+def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
+    """Check the form of observations ``(n_envs, ...)``, or of a dict of them."""
+    if isinstance(space, spaces.Dict) and isinstance(obs, dict) and obs.keys() >= space.spaces.keys():
+        for key, part in space.spaces.items():
+            check_batch(part, obs[key], n_envs)
+        return
+    rows = np.asarray(obs)
+    if rows.shape[:1] != (n_envs,):
+        raise BadData(f"The observations must be those of {n_envs} environments, got shape {rows.shape}")
+    # Rows of one array share their form; what is not in a Box must be in its space too
+    for i in range(1 if isinstance(space, spaces.Box) else n_envs):
+        check_observation(space, rows[i], i)
 
 
 def copy(obs: Any) -> Any:

@@ -158,16 +158,6 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def check_deltas(deltas: Any, n_delta: int, n_parameters: int) -> th.Tensor:
-    """Return the result of a perturbation, ``(k, n)``, in float64 if it is a finite tensor of this shape."""
-    return _check_tensor("perturbation", deltas, (n_delta, n_parameters))
-
-
-def check_estimate(gradient: Any, n_parameters: int) -> th.Tensor:
-    """Return the result of an estimator, ``(n,)``, in float64 if it is a finite tensor of this shape."""
-    return _check_tensor("estimator", gradient, (n_parameters,))
-
-
 def check_candidates(candidates: Any, n_parameters: int) -> th.Tensor:
     """Return what an estimator calls the utility with, ``(k, n)`` or ``(m, k, n)``, in float64 if it is finite."""
     shape = tuple(candidates.shape) if isinstance(candidates, th.Tensor) else ()
@@ -176,10 +166,10 @@ def check_candidates(candidates: Any, n_parameters: int) -> th.Tensor:
             f"candidates must be a tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), but the estimator "
             f"called the utility with {shape or candidates!r}"
         )
-    return _check_tensor("estimator", candidates, shape)
+    return check_tensor("estimator", candidates, shape)
 
 
-def _check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:
+def check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:
     """Return a finite tensor of one shape in float64 on the CPU."""
     if not isinstance(value, th.Tensor) or value.shape != shape:
         got = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, th.Tensor) else repr(value)

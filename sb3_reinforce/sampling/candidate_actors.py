@@ -22,12 +22,10 @@ from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, tempera
 
 
 class LoopActor:
-    """
-    The policy's own ``predict``, in one environment after the other, for any policy.
+    """The policy's own ``predict``, in one environment after the other; a candidate is in it only while it predicts."""
 
-    A candidate is in the policy only while it predicts. A deep copy would not do: hooks and replaced methods may refer
-    to the policy that they were made for, and policies that hold a graph, as with gSDE, cannot be copied.
-    """
+    # A deep copy would not do: hooks and replaced methods may refer to the policy that they were made for, and policies
+    # that hold a graph, as with gSDE, cannot be copied
 
     def __init__(
         self, policy: ActorCriticPolicy, searched: Sequence[th.nn.Parameter], n_envs: int, deterministic: bool

@@ -1,12 +1,9 @@
 """
 Many parameter vectors evaluated side by side in one VecEnv.
 
-The queue of (candidate, episode) pairs is fixed before the first step, so that candidates with short episodes are not
-sampled more often than others. There are two ways to work it off:
-
-- With seeds, in rounds: as many pairs as there are environments start together, each from the seed of its episode. A
-  VecEnv resets an environment as soon as its episode ends, without a seed, so the others wait for the longest episode.
-- Without seeds, in one go: an environment whose episode ends takes the next pair of the queue.
+The queue of (candidate, episode) pairs is fixed before the first step, or short episodes would be sampled more often.
+With seeds it is worked off in rounds, whose pairs start together from the seeds of their episodes: a VecEnv resets an
+environment without a seed. Without seeds an environment whose episode ends takes the next pair.
 """
 
 from collections.abc import Callable
@@ -17,11 +14,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_reinforce.envs.checks import all_finite, format_number, is_finite
+from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
-UNCHANGED = "The policy is the one before this update."
 
 
 # Not frozen: one is made at each step, which would take three times as long
@@ -51,29 +47,15 @@ class EpisodeTracker:
 
     def add(self, rewards: np.ndarray, obs: Any) -> None:
         """Add a step, after checking that its numbers are finite and that no episode is longer than allowed."""
+        check_finite("The reward", rewards, (None,))
+        check_finite("The observation", obs, (None,))
         self.totals += rewards
-        self.check("The reward", rewards)
-        self.check("The observation", obs)
         self.clock += 1
         if self.clock > self.deadline:
-            late = int(np.argmax(self.active & (self.started_at + self.max_episode_steps == self.deadline)))
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps "
-                f"({self.describe(late)}): give the environment a time limit, or raise max_episode_steps. {UNCHANGED}"
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps: give the "
+                "environment a time limit, or raise max_episode_steps. The policy is the one before this update."
             )
-
-    def check(self, name: str, values: Any) -> None:
-        """Check that numbers of shape ``(n_envs, ...)``, or dicts of them, are finite where a candidate acts."""
-        if isinstance(values, dict):
-            for key, part in values.items():
-                self.check(f"{name} {key!r}", part)
-            return
-        if all_finite(values):
-            return
-        bad = ~is_finite(values).reshape(len(values), -1).all(1) & self.active
-        if bad.any():
-            env = int(bad.argmax())
-            raise ValueError(f"{name} of {self.describe(env)} is not finite: {format_number(values[env])}. {UNCHANGED}")
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """Write the finished episodes to ``returns[candidate, episode]``, and list the environments with new pairs."""
@@ -90,11 +72,6 @@ class EpisodeTracker:
                 self.active[env] = False
         self.deadline = self.max_episode_steps + int(self.started_at[self.active].min(initial=self.clock))
         return restarted
-
-    def describe(self, env: int) -> str:
-        """Where an environment is, for a message."""
-        candidate, episode = self.pairs[env]
-        return f"candidate {candidate}, episode {episode}, step {self.clock - self.started_at[env]} (environment {env})"
 
 
 def evaluate_candidates(
@@ -113,10 +90,12 @@ def evaluate_candidates(
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
         env.reset()
-    for queue in schedule_episodes(len(thetas), n_episodes, env.num_envs, in_rounds=seeds is not None):
-        tracker = EpisodeTracker(queue, env.num_envs, max_episode_steps)
+    queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(len(thetas))]
+    size = len(queue) if seeds is None else env.num_envs
+    for first in range(0, len(queue), size):
+        tracker = EpisodeTracker(queue[first : first + size], env.num_envs, max_episode_steps)
         obs = start_episodes(env, tracker.pairs, seeds)
-        tracker.check("The observation", obs)
+        check_finite("The observation", obs, (None,))
         started = list(range(len(tracker.pairs)))
         # any() costs several times as much on a few numbers
         while np.count_nonzero(tracker.active):
@@ -132,27 +111,15 @@ def evaluate_candidates(
     return returns
 
 
-def schedule_episodes(n_candidates: int, n_episodes: int, n_envs: int, in_rounds: bool) -> list[list[Pair]]:
-    """All pairs, the first episodes first, in one queue or in rounds of at most ``n_envs``."""
-    queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(n_candidates)]
-    size = n_envs if in_rounds else len(queue)
-    return [queue[first : first + size] for first in range(0, len(queue), size)]
-
-
 def start_episodes(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> Any:
-    """
-    The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``.
-
-    ``VecEnv.seed(s)`` can only give environment i the seed s + i. So each environment is seeded by a reset through
-    ``env_method``, and the reset of all that follows, which goes through every wrapper, continues its random numbers.
-    """
+    """The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``."""
+    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
+    # all that follows, which goes through every wrapper, continues its random numbers
     if seeds is not None:
-        envs_with: dict[int, list[int]] = {}
-        for i, pair in enumerate(pairs):
-            envs_with.setdefault(int(seeds[pair]), []).append(i)
-        for seed, envs in envs_with.items():
+        starts = np.array([seeds[pair] for pair in pairs])
+        for seed in np.unique(starts).tolist():
             try:
-                env.env_method("reset", seed=seed, indices=envs)
+                env.env_method("reset", seed=seed, indices=np.flatnonzero(starts == seed).tolist())
             except NotImplementedError as error:
                 raise ValueError(
                     "Candidates that are to start from the same seeds need env_method('reset', seed=...), which "

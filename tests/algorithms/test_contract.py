@@ -13,7 +13,7 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, make, moved_by_learning, plain
+from models import KINDS, all_kinds, make, moved_by_learning, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import (
@@ -29,13 +29,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
-all_kinds = pytest.mark.parametrize("kind", KINDS)
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
 
 FLAT = spaces.Box(-1, 1, (3,))
@@ -65,14 +64,14 @@ def assert_trains(model):
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
-@both_modes
+@all_kinds
 @pytest.mark.parametrize(("observation_space", "action_space", "policy"), SPACES, ids=str)
 def test_spaces(observation_space, action_space, policy, kind):
     """In training and in ``predict``; the stored actions of discrete spaces count from 0."""
     env = make_vec_env(lambda: Random(observation_space, action_space), 2, seed=0)
-    model = make(kind, env, policy, seed=0, ent_coef=0.01)
+    model = make(kind, env, policy, seed=0)
     assert_trains(model)
-    assert isinstance(action_space, spaces.Box) or model.rollout_buffer.actions.min() == 0
+    assert kind == "search" or isinstance(action_space, spaces.Box) or model.rollout_buffer.actions.min() == 0
     actions, _ = model.predict(env.reset())
     assert len(actions) == 2 and all(action_space.contains(action) for action in actions)
 
@@ -143,16 +142,19 @@ def test_a_policy_may_be_compiled():
     assert any("action_net" in name for name in moved_by_learning(model, 16))
 
 
-@both_modes
+LOCALS = {"self", "new_obs", "rewards", "dones", "infos"}
+LOCALS_OF_A2C = {
+    *(LOCALS | {"env", "rollout_buffer", "total_timesteps", "tb_log_name"}),
+    *("actions", "clipped_actions", "values", "log_probs", "n_steps"),
+}
+
+
+@all_kinds
 def test_a_callback_stops_training_at_the_very_step(kind):
     model = make(kind, make_vec_env(lambda: Corridor((4,)), 2))
-    locals_of_a2c = {
-        *("self", "env", "rollout_buffer", "total_timesteps", "tb_log_name", "new_obs", "rewards", "dones", "infos"),
-        *("actions", "clipped_actions", "values", "log_probs", "n_steps"),
-    }
 
     def stop(locals_, globals_):
-        assert locals_.keys() >= locals_of_a2c
+        assert locals_.keys() >= (LOCALS if kind == "search" else LOCALS_OF_A2C)
         return np.bool_(model.num_timesteps < 42)
 
     ends = Record(lambda model: None)
@@ -162,13 +164,13 @@ def test_a_callback_stops_training_at_the_very_step(kind):
     assert model.num_timesteps >= 62
 
 
-@both_modes
+@all_kinds
 def test_callbacks_of_sb3(kind, tmp_path):
     pytest.importorskip("rich")
-    env, eval_env = make_vec_env("CartPole-v1", 2), make_vec_env("CartPole-v1", 1)
+    env, eval_env = (VecNormalize(make_vec_env("CartPole-v1", n_envs)) for n_envs in (2, 1))
     stop, every = StopTrainingOnRewardThreshold(reward_threshold=1e9), Record(lambda model: None, at="step")
     callbacks = [
-        CheckpointCallback(save_freq=50, save_path=tmp_path),
+        CheckpointCallback(save_freq=50, save_path=tmp_path, save_vecnormalize=True),
         EvalCallback(eval_env, callback_on_new_best=stop, best_model_save_path=tmp_path, eval_freq=60, verbose=0),
         EveryNTimesteps(80, every),
         LogEveryNTimesteps(70),
@@ -176,21 +178,39 @@ def test_callbacks_of_sb3(kind, tmp_path):
     ]
     with pytest.warns(Warning, match="rich is experimental"):
         make(kind, env).learn(300, callback=callbacks, progress_bar=True)
-    assert (tmp_path / "best_model.zip").exists() and list(tmp_path.glob("rl_model_*")) and every.records
+    assert (tmp_path / "best_model.zip").exists() and every.records
+    KINDS[kind][0].load(next(tmp_path.glob("rl_model_*steps.zip")))
+    assert VecNormalize.load(str(next(tmp_path.glob("*vecnormalize*"))), make_vec_env("CartPole-v1", 2)).training
 
 
-def logged_keys(algorithm, env, folder):
-    model = algorithm("MlpPolicy", env, n_steps=64)
+def logged(model, folder):
+    """The last value of each key."""
     model.set_logger(configure(str(folder), ["json"]))
     model.learn(64 * 4, log_interval=1)
     model.logger.close()
-    return {key for line in (folder / "progress.json").read_text().splitlines() for key in json.loads(line)}
+    return {
+        key: value
+        for line in (folder / "progress.json").read_text().splitlines()
+        for key, value in json.loads(line).items()
+    }
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
 def test_the_log_has_the_keys_of_a2c_and_more(env, tmp_path):
+    ours, theirs = (algorithm("MlpPolicy", env, n_steps=64) for algorithm in (REINFORCE, A2C))
     more = {"train/grad_norm", "rollout/complete_fraction"}
-    assert logged_keys(REINFORCE, env, tmp_path / "ours") == logged_keys(A2C, env, tmp_path / "theirs") | more
+    assert logged(ours, tmp_path / "ours").keys() == logged(theirs, tmp_path / "theirs").keys() | more
+
+
+def test_the_log_of_a_search(tmp_path):
+    model = make("search", policy="LinearPolicy", policy_kwargs={}, estimator="regression", n_delta=20)
+    log = logged(model, tmp_path)
+    train = "n_updates learning_rate delta_std grad_norm r_squared residual_std standard_error"
+    rollout = "ep_rew_mean ep_len_mean utility_mean utility_std"
+    clock = "iterations fps time_elapsed total_timesteps"
+    folders = {"train": train, "rollout": rollout, "time": clock}
+    assert log.keys() == {f"{folder}/{key}" for folder, keys in folders.items() for key in keys.split()}
+    assert np.isfinite(list(log.values())).all() and log["time/total_timesteps"] == model.num_timesteps
 
 
 def test_tensorboard(tmp_path):
@@ -199,20 +219,11 @@ def test_tensorboard(tmp_path):
     assert list((tmp_path / "REINFORCE_1").glob("events*"))
 
 
-@both_modes
+@all_kinds
 def test_load_with_another_number_of_environments(kind, tmp_path):
     make(kind, make_vec_env("CartPole-v1", 2)).learn(100).save(tmp_path / "model")
-    model = REINFORCE.load(tmp_path / "model", env=make_vec_env("CartPole-v1", 5)).learn(100)
-    assert model.n_envs == 5 and model.rollout_buffer.rewards.shape[1] == 5
-
-
-def test_parameters_come_from_a2c():
-    """``exact_match=False``, since A2C has no optimizer for the critic alone."""
-    other = A2C("MlpPolicy", "CartPole-v1", policy_kwargs={"optimizer_class": th.optim.Adam}).learn(32)
-    model = make("steps", policy_kwargs={})
-    model.set_parameters(other.get_parameters(), exact_match=False)
-    assert all(map(th.equal, model.policy.parameters(), other.policy.parameters()))
-    model.learn(64)
+    model = KINDS[kind][0].load(tmp_path / "model", env=make_vec_env("CartPole-v1", 5)).learn(100)
+    assert model.n_envs == 5 and (kind == "search" or model.rollout_buffer.rewards.shape[1] == 5)
 
 
 def test_the_callers_policy_kwargs_are_not_written_to():
@@ -301,7 +312,7 @@ def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(space, 
     assert moved_by_learning(model, 20) == {name for name in names if "value_net" in name}
 
 
-@both_modes
+@all_kinds
 def test_a_policy_that_is_replaced_or_frozen_after_construction(kind):
     """As in A2C: what is trained is read from the policy at each step."""
     model, other = make(kind), make(kind)

@@ -8,10 +8,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch as th
 from callbacks import At
-from models import KINDS, make, plain
+from models import KINDS, all_kinds, both, make, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
@@ -54,7 +53,7 @@ def go_on(kind, folder):
     (folder / "end.pkl").write_bytes(pickle.dumps(finish(model, env)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@all_kinds
 def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
     schedules = {"learning_rate": LinearSchedule(1e-3, 0, 1)}
     if kind == "steps":
@@ -101,7 +100,7 @@ def test_generators_of_other_devices_are_left_alone(tmp_path, monkeypatch):
     assert asked == []
 
 
-@pytest.mark.parametrize("kind", ["steps", "search"])
+@both
 def test_a_new_seed_at_load_draws_other_numbers(kind, tmp_path):
     kwargs = {"common_random_numbers": True} if kind == "search" else {}
     make(kind, make_vec_env("CartPole-v1", 2), seed=0, **kwargs).learn(100).save(tmp_path / "model")

@@ -8,9 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from environments import Corridor
+from callbacks import At
+from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, make
+from models import KINDS, both, make
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,7 +23,6 @@ from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARG
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
-both = pytest.mark.parametrize("kind", ["steps", "search"])
 
 NO_NUMBERS = ["x", True, [1], 1j, None]
 WRONG = {
@@ -79,12 +79,10 @@ def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
     assert model._last_obs is None and model.num_timesteps == 0
 
 
-class RecurrentActorCriticPolicy(ActorCriticPolicy):
-    """Has the name of sb3-contrib's."""
-
-
-class MaskableActorCriticPolicy(ActorCriticPolicy):
-    """Has the name of sb3-contrib's."""
+RECURRENT, MASKABLE = (
+    type(name, (ActorCriticPolicy,), {"__doc__": "Has the name of sb3-contrib's."})
+    for name in ("RecurrentActorCriticPolicy", "MaskableActorCriticPolicy")
+)
 
 
 @pytest.mark.parametrize(
@@ -100,8 +98,8 @@ class MaskableActorCriticPolicy(ActorCriticPolicy):
         ("steps", {"policy": "MLPPolicy"}, ["policy", "'CnnPolicy'", "'MLPPolicy': did you mean 'MlpPolicy'?"]),
         ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
         ("steps", {"policy": "MlpLstmPolicy"}, ["policy", "recurrent", "MlpLstmPolicy", "VecFrameStack"]),
-        ("search", {"policy": RecurrentActorCriticPolicy}, ["policy", "recurrent", "VecFrameStack"]),
-        ("steps", {"policy": MaskableActorCriticPolicy}, ["policy", "masked", "logits", "MaskablePPO"]),
+        ("search", {"policy": RECURRENT}, ["policy", "recurrent", "VecFrameStack"]),
+        ("steps", {"policy": MASKABLE}, ["policy", "masked", "logits", "MaskablePPO"]),
         ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
         ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
@@ -212,14 +210,8 @@ def test_a_schedule_is_called_once_where_its_value_is_needed_once():
 @both
 def test_a_callback_may_replace_a_schedule(kind):
     name = "ent_coef" if kind == "steps" else "delta_std"
-
-    class Replace(BaseCallback):
-        def _on_step(self):
-            setattr(self.model, name, "x")
-            return True
-
     with pytest.raises(TypeError, match=f"{name} must be a number or a schedule"):
-        make(kind, **{name: 0.1}).learn(1000, Replace())
+        make(kind, **{name: 0.1}).learn(1000, At(1, lambda model: setattr(model, name, "x")))
 
 
 @both
@@ -304,51 +296,33 @@ def test_integers_of_numpy(kind, tmp_path):
     type(model).load(tmp_path / "model", env=gym.make("CartPole-v1"), **given).learn(16)
 
 
-def in_spaces(**changed):
-    """An environment with any spaces."""
+@both
+@pytest.mark.parametrize(
+    ("name", "space", "problem"),
+    [
+        ("observation_space", spaces.Box(0, 1, (3, 0)), "must not be empty"),
+        ("observation_space", spaces.Dict({}), "must not be empty"),
+        ("observation_space", spaces.Dict(a=spaces.Box(0, 1, (0,))), "under 'a' must not be empty"),
+        ("observation_space", spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
+        ("observation_space", spaces.Text(3), "must be Box"),
+        ("observation_space", spaces.Discrete(4, start=2), "must start at 0"),
+        ("observation_space", spaces.MultiDiscrete([2, 2], start=[0, 1]), "must start at 0"),
+        ("observation_space", spaces.Box(-1, 1, ()), "must have a dimension"),
+        ("observation_space", spaces.Dict(x=spaces.Box(-1, 1, ())), "under 'x' must have a dimension"),
+        ("observation_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
+        ("action_space", spaces.Box(-1, 1, (0,)), "must not be empty"),
+        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "must have finite bounds"),
+        ("action_space", spaces.MultiBinary([2, 3]), "must have one dimension"),
+        ("action_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
+        ("action_space", spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
+        ("action_space", spaces.Dict(a=spaces.Discrete(2)), "must be Box"),
+    ],
+)
+def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
     env = Corridor()
-    for name, space in changed.items():
-        setattr(env, name, space)
-    return env
-
-
-@both
-@pytest.mark.parametrize(
-    ("space", "problem"),
-    [
-        (spaces.Box(0, 1, (3, 0)), "must not be empty"),
-        (spaces.Dict({}), "must not be empty"),
-        (spaces.Dict(a=spaces.Box(0, 1, (0,))), "under 'a' must not be empty"),
-        (spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
-        (spaces.Text(3), "must be Box"),
-        (spaces.Discrete(4, start=2), "must start at 0"),
-        (spaces.MultiDiscrete([2, 2], start=[0, 1]), "must start at 0"),
-        (spaces.Box(-1, 1, ()), "must have a dimension"),
-        (spaces.Dict(x=spaces.Box(-1, 1, ())), "under 'x' must have a dimension"),
-        (spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
-    ],
-)
-def test_an_observation_space_that_no_policy_can_see(kind, space, problem):
-    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
-    with pytest.raises(ValueError, match=f"observation space {problem}"):
-        make(kind, in_spaces(observation_space=space), policy)
-
-
-@both
-@pytest.mark.parametrize(
-    ("space", "problem"),
-    [
-        (spaces.Box(-1, 1, (0,)), "must not be empty"),
-        (spaces.Box(-np.inf, np.inf, (2,)), "must have finite bounds"),
-        (spaces.MultiBinary([2, 3]), "must have one dimension"),
-        (spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
-        (spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
-        (spaces.Dict(a=spaces.Discrete(2)), "must be Box"),
-    ],
-)
-def test_an_action_space_that_no_policy_can_act_in(kind, space, problem):
-    with pytest.raises(ValueError, match=f"action space {problem}"):
-        make(kind, in_spaces(action_space=space))
+    setattr(env, name, space)
+    with pytest.raises(ValueError, match=f"{name.replace('_', ' ')} {problem}"):
+        make(kind, env, "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy")
 
 
 @both
@@ -356,4 +330,4 @@ def test_a_policy_goes_with_its_observations(kind):
     with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
         make(kind, Corridor(), "MultiInputPolicy")
     with pytest.raises(ValueError, match="MultiInputPolicy"):
-        make(kind, in_spaces(observation_space=spaces.Dict(a=spaces.Box(0, 1))))
+        make(kind, Random(spaces.Dict(a=spaces.Box(0, 1))))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
-from models import KINDS, make, plain
+from models import all_kinds, make, plain
 from stable_baselines3.common.env_util import make_vec_env
 
 NAN = float("nan")
@@ -44,7 +44,7 @@ def test_temperature_needs_an_action_net_and_min_std_a_log_std():
         floor_std(th.nn.Linear(1, 1), 0.1)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@all_kinds
 def test_a_gradient_that_is_not_finite_is_refused(kind):
     extra = {"standardize_utilities": False} if kind == "search" else {"normalize_advantage": False}
     model = make(kind, Corridor((7,), reward=lambda t, action: 3e38 * (1 - 2 * (action == 0))), **extra)

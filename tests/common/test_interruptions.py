@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from callbacks import At, Record
 from environments import Corridor, Faulty
-from models import KINDS, make, plain
+from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE
-
-all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
 @pytest.fixture(autouse=True)

@@ -11,14 +11,13 @@ import torch as th
 from callbacks import At
 from environments import Corridor, Faulty
 from gymnasium import spaces
-from models import KINDS, make, plain
+from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
-all_kinds = pytest.mark.parametrize("kind", KINDS)
 bare_or_normalized = pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 
 

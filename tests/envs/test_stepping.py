@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from models import KINDS
+from models import all_kinds
 from models import make as make_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -83,7 +83,7 @@ def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
     assert sum(dones.sum() for (_, _, dones, _), _ in returned) > 50
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@all_kinds
 @pytest.mark.parametrize("method", ["step", "step_async", "step_wait", "reset"])
 def test_methods_of_the_users_own_are_called(method, kind):
     """Whether a subclass overrides them, or the user replaces them on one VecEnv."""

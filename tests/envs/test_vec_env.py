@@ -230,11 +230,16 @@ def test_other_forms_of_observations_are_accepted(form):
     assert make("steps", env).learn(100).num_timesteps >= 100
 
 
-@both_modes
-def test_episodes_that_gymnasium_records(mode):
+def test_episodes_that_gymnasium_records():
     """Also where one ends while another goes on."""
-    vector_env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode)
-    env = GymnasiumVecEnv(RecordEpisodeStatistics(vector_env))
+    modes = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+    recorders = [
+        RecordEpisodeStatistics(SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode))
+        for mode in modes
+    ]
+    with pytest.raises(ValueError, match="use VecMonitor"):
+        GymnasiumVecEnv(recorders[1])
+    env = GymnasiumVecEnv(recorders[0])
     env.seed(0)
     env.reset()
     lengths, recorded = np.zeros(N_ENVS, dtype=int), []
@@ -248,7 +253,8 @@ def test_episodes_that_gymnasium_records(mode):
 
 
 @both_modes
-def test_copies_in_other_processes_start_from_the_same_seeds(mode):
+@pytest.mark.parametrize("estimator", ["central", "regression"])
+def test_copies_in_other_processes_start_from_the_same_seeds(estimator, mode):
     """By which a search compares its candidates."""
 
     def env_fn():
@@ -257,7 +263,7 @@ def test_copies_in_other_processes_start_from_the_same_seeds(mode):
     thetas, utilities = [], []
     for vector_env in (SyncVectorEnv, AsyncVectorEnv):
         env = synced(env_fn, mode, vector_env)
-        model = FiniteDifference("LinearPolicy", env, n_delta=11, seed=0).learn(60)
+        model = FiniteDifference("LinearPolicy", env, estimator=estimator, n_delta=11, seed=0).learn(60)
         thetas.append(model.theta)
         utilities.append(landscape(model, n_points=3, n_episodes=2).utilities)
         env.close()

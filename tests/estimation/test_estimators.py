@@ -6,7 +6,6 @@ import torch as th
 
 from sb3_reinforce.estimation import (
     ESTIMATORS,
-    Utility,
     central_difference,
     fit_quality,
     forward_difference,
@@ -18,17 +17,17 @@ N = 5
 SEEDS = pytest.mark.parametrize("seed", range(20))
 
 
-def normal(*shape: int, seed: int) -> th.Tensor:
+def normal(*shape, seed):
     return gaussian(int(np.prod(shape[:-1])), shape[-1], th.Generator().manual_seed(seed)).reshape(shape)
 
 
-def linear(seed: int) -> tuple[Utility, th.Tensor]:
+def linear(seed):
     slope = normal(1, N, seed=seed)[0]
     return lambda x: x @ slope + 7, slope
 
 
 @SEEDS
-def test_all_are_exact_on_linear_utilities(seed: int) -> None:
+def test_all_are_exact_on_linear_utilities(seed):
     utility, slope = linear(seed)
     theta, deltas = normal(1, N, seed=seed + 1)[0], normal(2 * N, N, seed=seed + 2)
     for estimator in ESTIMATORS.values():
@@ -36,10 +35,10 @@ def test_all_are_exact_on_linear_utilities(seed: int) -> None:
 
 
 @SEEDS
-def test_central_is_exact_on_quadratic_utilities(seed: int) -> None:
+def test_central_is_exact_on_quadratic_utilities(seed):
     matrix, theta = normal(N, N, seed=seed), normal(1, N, seed=seed + 1)[0]
 
-    def utility(x: th.Tensor) -> th.Tensor:
+    def utility(x):
         return ((x @ matrix) * x).sum(-1) + x.sum(-1)
 
     gradient = (matrix + matrix.T) @ theta + 1
@@ -49,7 +48,7 @@ def test_central_is_exact_on_quadratic_utilities(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "order"), [("forward", 1), ("regression", 1), ("central", 2)])
-def test_the_error_is_of_the_declared_order(name: str, order: int) -> None:
+def test_the_error_is_of_the_declared_order(name, order):
     theta = th.linspace(-1, 1, N, dtype=th.float64)
     deltas = normal(3 * N, N, seed=0)
     sizes = 2.0 ** -np.arange(4, 10)
@@ -63,10 +62,10 @@ def test_the_error_is_of_the_declared_order(name: str, order: int) -> None:
 
 @SEEDS
 @pytest.mark.parametrize("k", [1, 2, N, 2 * N])
-def test_regression_on_mirrored_perturbations_is_the_central_difference(seed: int, k: int) -> None:
+def test_regression_on_mirrored_perturbations_is_the_central_difference(seed, k):
     theta, deltas = normal(1, N, seed=seed)[0], normal(k, N, seed=seed + 1)
 
-    def utility(x: th.Tensor) -> th.Tensor:
+    def utility(x):
         return th.sin(3 * x).sum(-1) + 100
 
     mirrored = regression_gradient(utility, theta, th.cat([deltas, -deltas]))
@@ -74,7 +73,7 @@ def test_regression_on_mirrored_perturbations_is_the_central_difference(seed: in
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(name: str) -> None:
+def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(name):
     utility, slope = linear(0)
     deltas = normal(3, N, seed=1)
     directions = deltas - deltas.mean(0) if name == "regression" else deltas
@@ -83,17 +82,17 @@ def test_with_few_perturbations_the_estimate_is_the_projection_of_the_gradient(n
     th.testing.assert_close(estimate, th.linalg.pinv(directions) @ directions @ slope)
 
 
-def test_nearly_collinear_perturbations_are_solved_to_what_their_condition_allows() -> None:
+def test_nearly_collinear_perturbations_are_solved_to_what_their_condition_allows():
     utility, slope = linear(0)
     deltas = normal(1, N, seed=1) + 1e-6 * normal(2 * N, N, seed=2)
     # Of the normal equations, whose condition is the square, no digit would be left
     th.testing.assert_close(central_difference(utility, th.zeros(N).double(), deltas), slope, rtol=1e-6, atol=1e-6)
 
 
-def test_n_top_is_the_central_difference_of_the_best_perturbations() -> None:
+def test_n_top_is_the_central_difference_of_the_best_perturbations():
     theta, deltas = th.zeros(N).double(), normal(6, N, seed=0)
 
-    def utility(x: th.Tensor) -> th.Tensor:
+    def utility(x):
         return x.exp().sum(-1)
 
     best = th.maximum(utility(deltas), utility(-deltas)).argsort(descending=True)[:2]
@@ -103,8 +102,8 @@ def test_n_top_is_the_central_difference_of_the_best_perturbations() -> None:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(name: str) -> None:
-    def utility(x: th.Tensor) -> th.Tensor:
+def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(name):
+    def utility(x):
         raise AssertionError("evaluated")
 
     equal = th.full((4, N), 0.1 if name == "regression" else 0.0).double()
@@ -112,7 +111,7 @@ def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(nam
         ESTIMATORS[name](utility, th.zeros(N).double(), equal)
 
 
-def test_fit_quality_is_a_textbook_regressions() -> None:
+def test_fit_quality_is_a_textbook_regressions():
     m = 400
     slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]
     utilities = 3 + deltas @ slope + 0.5 * noise
@@ -128,7 +127,7 @@ def test_fit_quality_is_a_textbook_regressions() -> None:
     th.testing.assert_close(fit.standard_error, (variance * th.linalg.inv(design.T @ design).diag()[1:]).sqrt())
 
 
-def test_fit_quality_without_degrees_of_freedom_or_variance_is_not_made_up() -> None:
+def test_fit_quality_without_degrees_of_freedom_or_variance_is_not_made_up():
     deltas = normal(3, N, seed=0)
     fit = fit_quality(deltas, th.ones(3).double(), th.zeros(N).double())
     assert np.isnan(fit.r_squared) and np.isnan(fit.residual_std) and fit.standard_error is None

@@ -6,12 +6,12 @@ import torch as th
 from sb3_reinforce.estimation import PERTURBATIONS, coordinate, rademacher, sphere
 
 
-def generator(seed: int = 0) -> th.Generator:
+def generator(seed=0):
     return th.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("name", PERTURBATIONS)
-def test_shape_type_and_reproducibility(name: str) -> None:
+def test_shape_type_and_reproducibility(name):
     first, again, other = (PERTURBATIONS[name](7, 5, generator(seed)) for seed in (0, 0, 1))
     assert first.shape == (7, 5) and first.dtype == th.float64
     assert th.equal(first, again)
@@ -19,7 +19,7 @@ def test_shape_type_and_reproducibility(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["sphere", "gaussian", "rademacher"])
-def test_random_directions_have_mean_zero_and_identity_covariance(name: str) -> None:
+def test_random_directions_have_mean_zero_and_identity_covariance(name):
     k = 100_000
     deltas = PERTURBATIONS[name](k, 4, generator())
     # Standard errors: 1/√k of a mean, at most √2/√k of a second moment; five of them
@@ -27,14 +27,14 @@ def test_random_directions_have_mean_zero_and_identity_covariance(name: str) -> 
     th.testing.assert_close(deltas.T @ deltas / k, th.eye(4).double(), rtol=0, atol=5 * (2 / k) ** 0.5)
 
 
-def test_norms() -> None:
+def test_norms():
     for perturbation in (sphere, rademacher):
         norms = perturbation(9, 6, generator()).norm(dim=1)
         th.testing.assert_close(norms, th.full((9,), 6**0.5).double())
     assert set(rademacher(9, 6, generator()).unique().tolist()) == {-1.0, 1.0}
 
 
-def test_coordinates_visit_all_parameters_with_alternating_sign() -> None:
+def test_coordinates_visit_all_parameters_with_alternating_sign():
     deltas = coordinate(10, 4, generator())
     for rows, sign in ((deltas[:4], 1), (deltas[4:8], -1)):
         th.testing.assert_close(rows.abs().sum(0), th.ones(4).double())

@@ -2,14 +2,12 @@
 
 import os
 import signal
-from typing import Any
 
 import numpy as np
 import pytest
-import torch as th
-from models import KINDS, Scaled, make, plain
+from callbacks import Record
+from models import Scaled, all_kinds, make, plain
 from stable_baselines3 import A2C
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
@@ -17,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce.diagnostics import compare_estimators, landscape
 from sb3_reinforce.sampling.measurement import undisturbed
 
-MEASUREMENTS: dict[str, Any] = {
+MEASUREMENTS = {
     "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
     "compare_estimators": lambda model: compare_estimators(
         model, n_episodes=3, n_estimates=3, n_delta=2, n_resamples=5, estimators=("central", "likelihood_ratio")
@@ -25,14 +23,14 @@ MEASUREMENTS: dict[str, Any] = {
 }
 
 
-def observation(env: VecNormalize) -> np.ndarray:
+def observation(env):
     """What the environments show now."""
     return np.array([single.unwrapped.state for single in env.unwrapped.envs])
 
 
 @pytest.mark.parametrize("measure", MEASUREMENTS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind: str, measure: str) -> None:
+@all_kinds
+def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind, measure):
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     model = make(kind, env, policy_kwargs={"features_extractor_class": Scaled}).learn(20)
     before, count = plain(model.policy.state_dict()), env.obs_rms.count
@@ -45,34 +43,32 @@ def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_whatever_ends_a_measurement_the_next_run_begins_with_a_reset(error: type[BaseException]) -> None:
-    env = VecNormalize(make_vec_env("CartPole-v1", 2))
-    model = make("steps", env).learn(20)
-    with pytest.raises(error), undisturbed(model):
-        env.step(np.zeros(2, dtype=int))
-        raise error
-    assert env.training
+def test_whatever_ends_a_measurement_the_next_rollout_begins_with_a_reset(error):
+    """In the middle of training too, where a callback measures."""
+    env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_obs=False)
 
-    class First(BaseCallback):
-        def _on_step(self) -> bool:
-            return False
+    def fail(model):
+        with pytest.raises(error), undisturbed(model):
+            env.step(np.zeros(2, dtype=int))
+            raise error
+        assert env.training
+        buffer = model.rollout_buffer
+        return buffer.episode_starts[0].all() and np.abs(buffer.observations[0]).max() <= 0.05
 
-        def _on_rollout_start(self) -> None:
-            assert np.allclose(self.model._last_obs, env.normalize_obs(observation(env)), atol=1e-5)
-            assert self.model._last_episode_starts.all()
-
-    model.learn(20, First(), reset_num_timesteps=False)
+    rollouts = Record(fail)
+    make("steps", env).learn(64, rollouts)
+    assert rollouts.records == [True] * 4
 
 
 class Interrupted(ActorCriticPolicy):
     """Ctrl-C comes in the middle of a candidate's action."""
 
-    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+    def _predict(self, observation, deterministic=False):
         os.kill(os.getpid(), signal.SIGINT)
         return super()._predict(observation, deterministic)
 
 
-def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
+def test_ctrl_c_leaves_no_candidate_in_the_policy():
     model = A2C(Interrupted, "CartPole-v1", device="cpu")
     before = plain(model.policy.state_dict())
     with pytest.raises(KeyboardInterrupt):
@@ -80,23 +76,16 @@ def test_ctrl_c_leaves_no_candidate_in_the_policy() -> None:
     assert plain(model.policy.state_dict()) == before and model._last_obs is None
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind: str) -> None:
-    class Measure(BaseCallback):
-        n_made = 0
-
-        def _on_rollout_start(self) -> None:
-            with undisturbed(self.model):
-                self.n_made += 1
-
-        def _on_step(self) -> bool:
-            with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
-                self._on_rollout_start()
+@all_kinds
+def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind):
+    def measure(model):
+        with undisturbed(model):
             return True
 
-        def _on_rollout_end(self) -> None:
-            self._on_rollout_start()
+    def refused(model):
+        with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
+            measure(model)
 
-    callback = Measure()
-    model = make(kind).learn(50, callback)
-    assert callback.n_made == 2 * model._n_updates > 0
+    starts, ends = Record(measure, "rollout_start"), Record(measure, "rollout_end")
+    model = make(kind).learn(50, [starts, Record(refused, "step"), ends])
+    assert len(starts.records) == len(ends.records) == model._n_updates > 0
