@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.common.tensors import concatenate, flatten, select, stack, take
+from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
 from sb3_reinforce.estimation import Rollout
 from sb3_reinforce.policies.evaluation import Route
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
@@ -140,10 +140,8 @@ class RecurrentREINFORCE(REINFORCE):
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T
         following = take(rows, (steps, envs))
-        following["observations"] = concatenate(
-            obs_as_tensor(cast(Any, self._last_obs), self.device),
-            *(obs_as_tensor(stack([obs]), self.device) for obs in terminal_obs.values()),
-        )
+        observed = [self._last_obs, *(stack([obs]) for obs in terminal_obs.values())]
+        following["observations"] = concatenate(*(shaped_like(following["observations"], obs) for obs in observed))
         # An episode that has ended with the rollout does not go on in the next observation, whose V is not asked for
         following["sequence"][:n_envs][th.as_tensor(dones[-1])] = -1
         values = policy.sequence_values(concatenate(flatten(rows), following)).flatten().cpu().numpy()

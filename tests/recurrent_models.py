@@ -12,7 +12,11 @@ from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 VECTOR = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (1, 4, 4), np.uint8)
-SPACES = {"MlpLstmPolicy": VECTOR, "CnnLstmPolicy": IMAGE, "MultiInputLstmPolicy": spaces.Dict(a=VECTOR, b=VECTOR)}
+SPACES = {
+    "MlpLstmPolicy": VECTOR,
+    "CnnLstmPolicy": IMAGE,
+    "MultiInputLstmPolicy": spaces.Dict(a=VECTOR, b=spaces.Discrete(3)),
+}
 EXACT = {"rtol": 1e-9, "atol": 1e-10}
 
 

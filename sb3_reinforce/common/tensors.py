@@ -29,6 +29,13 @@ def select(tensors: TensorOrDict, mask: th.Tensor) -> TensorOrDict:
     return flatten(tensors) if bool(mask.all()) else take(tensors, mask)
 
 
+def shaped_like(tensors: TensorOrDict, obs: Any) -> TensorOrDict:
+    """A batch of observations in the shape of stored ones, which have one dimension more for single numbers."""
+    if isinstance(tensors, dict):
+        return {key: shaped_like(part, obs[key]) for key, part in tensors.items()}
+    return th.as_tensor(obs, device=tensors.device).reshape(-1, *tensors.shape[1:])
+
+
 def concatenate(*tensors: TensorOrDict) -> TensorOrDict:
     """The rows of all tensors, shape ``(n, ...)``, for each tensor of the dicts."""
     first = tensors[0]

@@ -138,6 +138,9 @@ class Ends(Record):
 @th.no_grad()
 def value_of(policy, episode):
     """V after a list of observations, by sb3-contrib's own methods."""
+    if isinstance(episode[0], dict):
+        # A rollout buffer holds a Discrete observation as an array, and the environment returns a number
+        episode = [{key: np.ravel(part) for key, part in obs.items()} for obs in episode]
     obs = stack(episode)
     obs = {key: part[:, None] for key, part in obs.items()} if isinstance(obs, dict) else obs[:, None]
     return float(by_steps(policy, obs, np.zeros((len(episode), 1), dtype=bool), policy.zero_state(1))[1][-1])
