@@ -38,7 +38,16 @@ from sb3_reinforce.policies.evaluation import (
     split_parameters,
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
+from sb3_reinforce.sampling.actors import Actor, make_actor
+from sb3_reinforce.sampling.collection import (
+    Bools,
+    Extent,
+    TerminalObs,
+    by_step,
+    check_rollout_data,
+    collect,
+    warn_of_own_methods,
+)
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -197,6 +206,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.rollout: Rollout | None = None
         #: Whether a rollout is being collected, so that its environments must be left alone
         self.is_collecting = False
+        self._state: th.Tensor | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -286,17 +296,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.rollout = None
         self.is_collecting = True
         try:
-            collected = collect(self, env, callback, rollout_buffer, extent, route)
+            collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
             if collected is None:
                 return False
             dones, terminal_obs, route = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
             next_values = None
             if route.with_critic:
-                rollout_buffer.values = values_along(self.policy, route, rollout_buffer)
-                next_values = values_after(
-                    self.policy, route, rollout_buffer.values, dones, self._last_obs, terminal_obs
-                )
+                rollout_buffer.values, next_values = self._evaluate_critic(route, rollout_buffer, dones, terminal_obs)
             self.rollout = complete_rollout(
                 rollout_buffer,
                 self.policy,
@@ -304,6 +311,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
                 None if n_rollout_steps else extent.quota,
                 self._running,
                 next_values,
+                self._state,
                 baseline=self._function("baseline", BASELINES),
                 gamma=self.gamma,
                 gae_lambda=self.gae_lambda,
@@ -327,6 +335,16 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _make_actor(self, route: Route, keep_outputs: bool) -> Actor:
+        return make_actor(self.policy, route, self.n_envs, keep_outputs)
+
+    def _evaluate_critic(
+        self, route: Route, buffer: RolloutBuffer, dones: Bools, terminal_obs: TerminalObs
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""
+        values = values_along(self.policy, route, buffer)
+        return values, values_after(self.policy, route, values, dones, self._last_obs, terminal_obs)
 
     @uninterrupted
     def train(self) -> None:

@@ -40,7 +40,7 @@ FOREIGN = {
 MAX_LINES = 250
 # The docstring of an algorithm's class is the reference of its arguments, and its update is read in one place
 LONGER = {"reinforce.py", "finite_difference.py", "recurrent.py"}
-PUBLIC = ("sb3_reinforce", "sb3_reinforce.diagnostics", "sb3_reinforce.estimation", "sb3_reinforce.zoo")
+PUBLIC = tuple(f"sb3_reinforce{part}" for part in ("", ".diagnostics", ".estimation", ".recurrent", ".zoo"))
 PRIVATE = re.compile(r"_[a-z]\w*")
 
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}

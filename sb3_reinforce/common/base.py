@@ -52,13 +52,16 @@ class BasePolicyGradient(BaseAlgorithm):
         # Stable-Baselines3 uses some arguments as soon as it has them
         for name in kwargs.keys() & self._arguments.keys():
             self._arguments[name](name, kwargs[name])
-        check_policy_name(policy, self.policy_aliases)
+        self._check_policy(policy)
         if needs_env or env is not None:
             env = check_env(env, verbose)
         # A copy: Stable-Baselines3 writes to it
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         super().__init__(env=env, **kwargs)
+
+    def _check_policy(self, policy: str | type) -> None:
+        check_policy_name(policy, self.policy_aliases)
 
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = self._schedule("learning_rate")

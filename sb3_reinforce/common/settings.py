@@ -35,7 +35,7 @@ MAX_LEARNING_RATE = 1e6
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
-STACK_FRAMES = "stack observations with VecFrameStack, or use RecurrentPPO of sb3-contrib"
+STACK_FRAMES = "use sb3_reinforce.recurrent.RecurrentREINFORCE, or stack observations with VecFrameStack"
 MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
 CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK}

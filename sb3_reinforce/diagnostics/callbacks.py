@@ -181,7 +181,7 @@ class PitfallCallback(Diagnosis):
         rollout = self.rollout = cast(Rollout, model.rollout)
         policy = rollout.policy
         is_first = rollout.used & (rollout.used.flatten().cumsum(0).view_as(rollout.used) <= self.N_STEPS)
-        self.obs = select(rollout.observations, is_first)
+        self.obs = select(rollout.inputs, is_first)
         self.actions = as_policy_actions(select(rollout.actions, is_first), model.action_space)
         self.temperature = temperature_of(policy)
         log_prob, _ = log_prob_and_entropy(policy, self.obs, self.actions)

@@ -146,7 +146,7 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     collector = undiscounted(model).sampling_copy(n_episodes, "leave_one_out")
     with undisturbed(model):
         env_of(model).seed(int(th.randint(2**31, ())))
-        rollout, _ = collect_episodes(collector)
+        rollout = collect_episodes(collector)
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
     wanted = {id(parameter) for parameter in actor_parameters(rollout.policy)}

@@ -1,26 +1,32 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_reinforce.common.arguments import check_function, check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import select, stack, to_vector
-from sb3_reinforce.diagnostics.policy_errors import log_prob_error, relative_difference, score_error, sign_error, spread
+from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.diagnostics.policy_errors import (
+    largest_difference,
+    log_prob_error,
+    relative_difference,
+    score_error,
+    sign_error,
+    spread,
+)
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy
+from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
-
-Infos = list[list[dict[str, Any]]]
 
 # By check: the largest error that passes, and what the error compares
 CHECKS = {
@@ -110,16 +116,22 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     """The error of each check; the last one trains the model's policy."""
     collector = model.sampling_copy(n_episodes, model.baseline)
     with undisturbed(model):
-        rollout, infos = collect_episodes(collector)
+        rollout = collect_episodes(collector)
     policy = rollout.policy
     scored_parameters(rollout)
-    obs = select(rollout.observations, rollout.used)
+    obs = select(rollout.inputs, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
+    if isinstance(policy, RecurrentPolicy):
+        # Its ``forward`` has no sequences: log π is compared as it was when the episodes were played
+        played = select(th.as_tensor(collector.rollout_buffer.log_probs), rollout.used)
+        difference = largest_difference(log_prob_and_entropy(policy, obs, actions)[0].detach().cpu(), played)
+    else:
+        difference = log_prob_error(policy, spread(obs, actions)[0])
     return {
-        "log_prob": log_prob_error(policy, spread(obs, actions)[0]),
+        "log_prob": difference,
         "scores": score_error(policy, *spread(obs, actions)),
         "sign": sign_error(policy, obs),
-        "returns": return_error(collector, rollout, infos),
+        "returns": return_error(collector, rollout),
         "weights": weight_error(collector, rollout),
         "surrogate": surrogate_error(collector, rollout),
     }
@@ -141,19 +153,12 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
     return returns
 
 
-def return_error(collector: REINFORCE, rollout: Rollout, infos: Infos) -> float:
+def return_error(collector: REINFORCE, rollout: Rollout) -> float:
     """The largest difference between a return and its definition, relative to the largest return."""
     expected = th.zeros_like(rollout.returns)
     for episode in th.unique(rollout.episodes[rollout.used]):
         steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
-        values = np.zeros(len(steps))
-        if rollout.values is not None:
-            values[:-1] = rollout.values[steps, envs][1:]
-            info = infos[int(steps[-1])][int(envs[-1])]
-            if info.get("TimeLimit.truncated"):
-                terminal = obs_as_tensor(stack([info["terminal_observation"]]), collector.device)
-                with th.no_grad():
-                    values[-1] = float(rollout.policy.predict_values(terminal))
+        values = np.zeros(len(steps)) if rollout.next_values is None else rollout.next_values[steps, envs].numpy()
         rewards = rollout.rewards[steps, envs].numpy()
         returns = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
         expected[steps, envs] = th.as_tensor(returns if collector.reward_to_go else np.full_like(returns, returns[0]))

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
+from sb3_reinforce.policies.evaluation import action_distribution
 from sb3_reinforce.policies.plain_mlp import temperature_hooks
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -187,7 +188,7 @@ def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
     """The mean standard deviation of a Gaussian policy's actions, which with gSDE ``train/std`` is not; else NaN."""
     if not isinstance(policy.action_space, spaces.Box):
         return math.nan
-    distribution = policy.get_distribution(obs).distribution
+    distribution = action_distribution(policy, obs).distribution
     return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
 
 

@@ -1,6 +1,7 @@
 """Errors of a policy that ``check_gradient`` measures: how far the two sides of each identity of log π are apart."""
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import torch as th
 from gymnasium import spaces
@@ -12,6 +13,7 @@ from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
 from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
+from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
@@ -28,12 +30,17 @@ def log_prob_error(policy: ActorCriticPolicy, obs: PyTorchObs) -> float:
     """The largest difference between log π of sampled actions in ``forward`` and in training."""
     drawn, _, log_prob = policy(obs)
     evaluated, _ = log_prob_and_entropy(policy, obs, as_evaluated(policy, drawn))
-    return float(((evaluated - log_prob).abs() / log_prob.abs().clamp(min=1)).max())
+    return largest_difference(evaluated, log_prob)
 
 
-def parts_of(obs: PyTorchObs) -> list[th.Tensor]:
+def largest_difference(log_prob: th.Tensor, other: th.Tensor) -> float:
+    """``max |log π − log π'|``, relative where log π is large."""
+    return float(((log_prob - other).abs() / other.abs().clamp(min=1)).max())
+
+
+def parts_of(obs: Any) -> list[th.Tensor]:
     """The tensors of a batch of observations."""
-    return list(obs.values()) if isinstance(obs, dict) else [obs]
+    return [each for part in obs.values() for each in parts_of(part)] if isinstance(obs, dict) else [obs]
 
 
 def size_of(obs: PyTorchObs) -> int:
@@ -116,6 +123,8 @@ def draw(policy: ActorCriticPolicy, obs: PyTorchObs) -> th.Tensor:
     """Independent actions for a batch of observations; with gSDE each has its own noise matrix."""
     if policy.use_sde:
         policy.reset_noise(len(parts_of(obs)[0]))
+    if isinstance(policy, RecurrentPolicy):
+        return as_evaluated(policy, policy.sequence_distribution(without_memory(cast(Any, obs))).get_actions())
     return as_evaluated(policy, policy(obs)[0])
 
 

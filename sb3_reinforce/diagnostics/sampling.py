@@ -38,21 +38,15 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     check_model(model)
     collector = model.sampling_copy(check_integer("n_episodes", n_episodes, 2), baseline)
     with undisturbed(model):
-        return collect_episodes(collector)[0]
+        return collect_episodes(collector)
 
 
-def collect_episodes(collector: REINFORCE) -> tuple[Rollout, list[list[dict[str, Any]]]]:
-    """Let a sampling copy collect its episodes; the rollout, and ``infos[t][i]`` of each step and environment."""
-    infos: list[list[dict[str, Any]]] = []
-
-    def record(variables: dict[str, Any], _: dict[str, Any]) -> bool:
-        infos.append(variables["infos"])
-        return True
-
-    recorder = ConvertCallback(record)
-    recorder.init_callback(collector)
-    collector.collect_rollouts(cast(VecEnv, collector.env), recorder, collector.rollout_buffer, None)
-    return cast(Rollout, collector.rollout), infos
+def collect_episodes(collector: REINFORCE) -> Rollout:
+    """Let a sampling copy collect its episodes; as for any callback, log π goes into its rollout buffer."""
+    callback = ConvertCallback(lambda *_: True)
+    callback.init_callback(collector)
+    collector.collect_rollouts(cast(VecEnv, collector.env), callback, collector.rollout_buffer, None)
+    return cast(Rollout, collector.rollout)
 
 
 @contextmanager

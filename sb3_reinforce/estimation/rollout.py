@@ -1,6 +1,7 @@
 """What was collected: the rollout that baselines read, and which of its steps belong to which episode."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -8,6 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, reward_to_go, total_return
+from sb3_reinforce.policies.sequences import RecurrentPolicy, episode_numbers, rows_of
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,9 @@ class Rollout:
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``
     :param policy: The policy that acted, with the parameters with which it acted
     :param denominator: What the sum over all steps is divided by
+    :param next_values: V(s_{t+1}), which is 0 after a terminal state, float64; None without ``baseline="value"``
+    :param state: The state of a recurrent policy before the first step, shape
+        ``(n_envs, 2, 2, n_layers, n_hidden)`` for actor and critic, hidden and cell state; None if all start from zero
     """
 
     observations: PyTorchObs
@@ -41,13 +46,20 @@ class Rollout:
     values: th.Tensor | None
     policy: ActorCriticPolicy
     denominator: int
+    next_values: th.Tensor | None = None
+    state: th.Tensor | None = None
 
     @property
     def episodes(self) -> th.Tensor:
         """The number of the episode that each step belongs to, from 0 on, shape ``(n_steps, n_envs)``, int64."""
-        ended_before = self.dones.long().cumsum(0) - self.dones.long()
-        n_episodes = ended_before[-1] + 1
-        return ended_before + n_episodes.cumsum(0) - n_episodes
+        return episode_numbers(self.dones)
+
+    @property
+    def inputs(self) -> Any:
+        """What the policy is evaluated on: the observations, with their sequences and states if it is recurrent."""
+        if isinstance(self.policy, RecurrentPolicy):
+            return rows_of(self.observations, self.dones.to(self.actions.device), self.state)
+        return self.observations
 
 
 @dataclass(frozen=True)

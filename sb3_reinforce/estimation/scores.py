@@ -49,7 +49,7 @@ def gradients_by_episode(
     """
     parameters = scored_parameters(rollout)
     w = th.stack([select(weight, rollout.used) for weight in weights]).to(parameters[0])
-    obs = select(rollout.observations, rollout.used)
+    obs = select(rollout.inputs, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
     _, rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)
     n = len(range(sum(parameter.numel() for parameter in parameters))[columns])
@@ -113,7 +113,7 @@ def scored_parameters(rollout: Rollout) -> Parameters:
     """``score_parameters`` of the policy that made a rollout, from its first step."""
     first = th.arange(1)
     actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
-    return score_parameters(rollout.policy, take(flatten(rollout.observations), first), actions)
+    return score_parameters(rollout.policy, take(flatten(rollout.inputs), first), actions)
 
 
 def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:

@@ -9,7 +9,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -25,6 +24,7 @@ def complete_rollout(
     quota: Integers | None,
     running: Running,
     next_values: Floats | None,
+    state: th.Tensor | None = None,
     *,
     baseline: Callable[[Rollout], th.Tensor],
     gamma: float,
@@ -63,8 +63,10 @@ def complete_rollout(
         returns=th.tensor(returns),
         discounts=th.as_tensor(gamma**exponents),
         values=None if next_values is None else th.as_tensor(buffer.values).double(),
+        next_values=None if next_values is None else th.as_tensor(next_values).double(),
         policy=policy,
         denominator=denominator,
+        state=state,
     )
     buffer.advantages = compute_advantages(rollout, baseline(rollout))
     buffer.returns = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
@@ -80,10 +82,11 @@ def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
 def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:
     """``γ^t (G_t − b_t)`` of the used steps in a row, shape ``(n,)``, float32; γ^t only with ``discount_scores``."""
     device = rollout.actions.device
-    weights = select(th.as_tensor(advantages, device=device), rollout.used)
+    weights: th.Tensor = select(th.as_tensor(advantages, device=device), rollout.used)
     if normalize:
         weights = standardize(weights)
-    return weights * select(rollout.discounts, rollout.used).to(weights)
+    discounts: th.Tensor = select(rollout.discounts.to(weights), rollout.used)
+    return weights * discounts
 
 
 def standardize(weights: th.Tensor) -> th.Tensor:
@@ -98,11 +101,12 @@ class Batch:
     """
     The ``n`` used steps of a rollout in a row, as ``train`` takes them.
 
+    ``observations`` are the rows of sequences for a recurrent policy.
     ``weights`` are γ^t (G_t − b_t) and ``returns`` what the critic is fitted to, float32; ``values`` are V(s_t) before
     the critic is fitted, float64 on the CPU, or None without a critic.
     """
 
-    observations: PyTorchObs
+    observations: Any
     actions: th.Tensor
     weights: th.Tensor
     returns: th.Tensor
@@ -113,7 +117,7 @@ def training_batch(rollout: Rollout, advantages: Floats, returns: Floats, normal
     """The used steps of a rollout, with the advantages and returns of the buffer, which a callback may have changed."""
     used = rollout.used
     return Batch(
-        observations=select(rollout.observations, used),
+        observations=select(rollout.inputs, used),
         actions=as_policy_actions(select(rollout.actions, used), rollout.policy.action_space),
         weights=compute_weights(rollout, advantages, normalize),
         returns=select(th.as_tensor(returns, device=rollout.actions.device), used),

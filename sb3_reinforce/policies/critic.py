@@ -1,6 +1,6 @@
 """The critic: its values along a rollout, and its regression on the returns with an optimizer apart."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,6 +17,7 @@ from sb3_reinforce.common import optimization
 from sb3_reinforce.common.tensors import flatten, stack, take
 from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, has_own_forward
 from sb3_reinforce.policies.plain_mlp import evaluate_layers, overrides
+from sb3_reinforce.policies.sequences import RecurrentPolicy, sequence_minibatches
 
 Value: TypeAlias = Callable[[Any], th.Tensor]
 
@@ -85,7 +86,7 @@ def fit_critic(
     value = value_of_batch(policy, route, parameters, obs, actions)
     with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
-            for batch in minibatches(len(returns), batch_size, returns.device):
+            for batch in minibatches(policy, obs, len(returns), batch_size):
                 # L = mean_t (G_t − V(s_t))²
                 loss = F.mse_loss(value(batch).flatten(), returns[batch])
                 gradients = th.autograd.grad(loss, parameters)
@@ -94,11 +95,13 @@ def fit_critic(
     return float(th.stack(losses).mean())
 
 
-def minibatches(n: int, size: int, device: th.device) -> Sequence[th.Tensor | slice]:
+def minibatches(policy: ActorCriticPolicy, obs: Any, n: int, size: int) -> Iterable[th.Tensor | slice]:
     """The steps of each minibatch, drawn without replacement; a single batch keeps its order."""
     if size >= n:
         return [slice(None)]
-    return th.randperm(n).to(device).split(size)  # type: ignore[no-untyped-call, no-any-return]
+    if isinstance(policy, RecurrentPolicy):
+        return sequence_minibatches(obs["sequence"], size)
+    return th.randperm(n).to(policy.device).split(size)  # type: ignore[no-untyped-call, no-any-return]
 
 
 def value_of_batch(
@@ -109,6 +112,8 @@ def value_of_batch(
 
     The features are computed once if the passes do not change the features extractor: they are the same in every pass.
     """
+    if isinstance(policy, RecurrentPolicy):
+        return lambda batch: policy.sequence_values(take(obs, batch))
     layers = route.critic
     extractor = policy.vf_features_extractor
     trained = {id(parameter) for parameter in parameters}

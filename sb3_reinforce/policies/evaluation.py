@@ -6,7 +6,7 @@ A method that a user has overridden is called as it is. Where nothing is overrid
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
@@ -24,6 +24,7 @@ from sb3_reinforce.policies.plain_mlp import (
     takes_vectors,
     temperature_hooks,
 )
+from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 Parameters: TypeAlias = list[nn.Parameter]
 
@@ -55,6 +56,8 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     ``forward`` and ``evaluate_actions`` compute the features that actor and critic share only once, but bypass a user's
     ``get_distribution`` and ``predict_values``.
     """
+    if isinstance(policy, RecurrentPolicy):
+        return Route(with_critic, actor=None, critic=None, forward=False, evaluate_actions=False)
     actor = plain_actor(policy)
     critic = plain_critic(policy) if with_critic else None
     if actor is not None:
@@ -98,6 +101,16 @@ def distribution_of(
     return kind.proba_distribution(outputs)
 
 
+def action_distribution(policy: ActorCriticPolicy, obs: Any) -> Distribution:
+    """π(·|s) for a batch of observations, or for the rows of sequences if the policy is recurrent."""
+    return policy.sequence_distribution(obs) if isinstance(policy, RecurrentPolicy) else policy.get_distribution(obs)
+
+
+def state_values(policy: ActorCriticPolicy, obs: Any) -> th.Tensor:
+    """V(s), shape ``(n, 1)``, for a batch of observations, or for the rows of sequences if the policy is recurrent."""
+    return policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
+
+
 def evaluate(
     policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, with_values: bool
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
@@ -111,14 +124,14 @@ def evaluate(
         values, log_prob, entropy = policy.evaluate_actions(obs, actions)
     else:
         if route.actor is None:
-            distribution = policy.get_distribution(obs)
+            distribution = action_distribution(policy, obs)
         else:
             features = extract_features(policy, obs, policy.pi_features_extractor)
             distribution = distribution_of(policy, evaluate_layers(route.actor, features))
         log_prob = distribution.log_prob(actions)
         entropy = distribution.entropy()
         if with_values:
-            values = policy.predict_values(obs)
+            values = state_values(policy, obs)
     if entropy is None:
         entropy = -log_prob
     return log_prob, entropy, None if values is None else values.flatten()

@@ -98,28 +98,31 @@ def is_unchanged(thing: Any) -> bool:
     return all(isinstance(hook, DivideLogits) for hook in hooks_of(thing))
 
 
-def plain_actor(policy: ActorCriticPolicy) -> list[nn.Module] | None:
+def plain_actor(policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = ActorCriticPolicy) -> list[nn.Module] | None:
     """
     The layers from the features to the logits or means of a policy whose actor is known to be plain, else None.
 
     They are ``Linear`` layers with a bias and elementwise activations, and the features are the observations in a row.
+    A class that overrides methods of ``base`` is not known to be plain.
     """
     distribution = getattr(policy, "action_dist", None)
     if type(distribution) not in DISTRIBUTIONS or not is_unchanged(distribution):
         return None
-    return plain_layers(policy, "pi_features_extractor", "policy_net", "action_net")
+    return plain_layers(policy, base, "pi_features_extractor", "policy_net", "action_net")
 
 
 def plain_critic(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     """The layers from the features to V of a policy whose critic is known to be plain, else None."""
-    return plain_layers(policy, "vf_features_extractor", "value_net", "value_net")
+    return plain_layers(policy, ActorCriticPolicy, "vf_features_extractor", "value_net", "value_net")
 
 
-def plain_layers(policy: ActorCriticPolicy, extractor: str, net: str, head: str) -> list[nn.Module] | None:
+def plain_layers(
+    policy: ActorCriticPolicy, base: type[ActorCriticPolicy], extractor: str, net: str, head: str
+) -> list[nn.Module] | None:
     """The layers after the features extractor, or None if anything on the way is not known to be plain."""
     # A user's policy may lack any of these parts
     mlp = getattr(policy, "mlp_extractor", None)
-    if own_methods(type(policy), ActorCriticPolicy) - CONSTRUCTION or type(mlp) is not MlpExtractor:
+    if own_methods(type(policy), base) - CONSTRUCTION or type(mlp) is not MlpExtractor:
         return None
     body = getattr(mlp, net)
     if type(body) is not nn.Sequential or not is_plain_extractor(getattr(policy, extractor, None)):

@@ -1,6 +1,7 @@
 """How a rollout is collected: a number of steps per environment, or a quota of whole episodes per environment."""
 
 import warnings
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, TypeAlias
@@ -16,7 +17,7 @@ from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.common.tensors import take
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.policies.evaluation import Route, route_of
-from sb3_reinforce.sampling.actors import Actor, make_actor
+from sb3_reinforce.sampling.actors import Actor
 
 Bools: TypeAlias = NDArray[np.bool_]
 # The terminal observation at each (step, environment) where a time limit ended an episode that counts
@@ -79,6 +80,7 @@ def collect(
     rollout_buffer: RolloutBuffer,
     extent: Extent,
     route: Route,
+    actor_of: Callable[[Route, bool], Actor],
 ) -> tuple[Bools, TerminalObs, Route] | None:
     """
     Step the environments and write what happens into a rollout buffer, which ends with one row per step.
@@ -90,7 +92,7 @@ def collect(
     policy = model.policy
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
-    actor = make_actor(policy, route, env.num_envs, keep_outputs=is_attached)
+    actor = actor_of(route, is_attached)
     as_env_actions = env_actions_of(policy, env.num_envs)
     # A copy: some VecEnvs reuse the array of the dones
     starts = [np.array(model._last_episode_starts, dtype=bool)]
@@ -137,7 +139,7 @@ def collect(
             write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
             route = route_of(policy, route.with_critic)
-            actor = make_actor(policy, route, env.num_envs)
+            actor = actor_of(route, is_attached)
             # The values of the rows so far came from another policy: they are computed in one batch instead
             route = replace(route, forward=False)
             first_row = n_steps

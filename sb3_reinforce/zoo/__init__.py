@@ -1,7 +1,7 @@
 """
-REINFORCE and FiniteDifference in the RL Zoo, as ``reinforce`` and ``finite_difference``.
+The algorithms in the RL Zoo: ``reinforce``, ``reinforce_lstm`` and ``finite_difference``.
 
-Importing this package registers both, with their settings and their Optuna samplers; a script around ``rl_zoo3`` needs
+Importing this package registers them, with their settings and their Optuna samplers; a script around ``rl_zoo3`` needs
 nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce --env CartPole-v1``.
 """
 
@@ -23,7 +23,15 @@ from sb3_reinforce.zoo.experiments import ALGORITHMS, HYPERPARAMS, Experiment, m
 __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 
 rl_zoo3.ALGOS.update(ALGORITHMS)
-HYPERPARAMS_SAMPLER.update(reinforce=samplers.sample_reinforce, finite_difference=samplers.sample_finite_difference)
-HYPERPARAMS_CONVERTER.update(reinforce=convert_onpolicy_params, finite_difference=samplers.convert_finite_difference)
+HYPERPARAMS_SAMPLER.update(
+    reinforce=samplers.sample_reinforce,
+    reinforce_lstm=samplers.sample_reinforce,
+    finite_difference=samplers.sample_finite_difference,
+)
+HYPERPARAMS_CONVERTER.update(
+    reinforce=convert_onpolicy_params,
+    reinforce_lstm=convert_onpolicy_params,
+    finite_difference=samplers.convert_finite_difference,
+)
 # The command train makes its experiment by this name
 rl_zoo3.train.ExperimentManager = make_experiment  # type: ignore[misc,assignment]

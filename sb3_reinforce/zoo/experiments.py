@@ -1,4 +1,4 @@
-"""Experiments of the RL Zoo with REINFORCE and FiniteDifference: their settings are found, checked and converted."""
+"""Experiments of the RL Zoo with the algorithms of this package: their settings are found, checked and converted."""
 
 import difflib
 import importlib
@@ -22,17 +22,22 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.finite_difference import FiniteDifference
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.reinforce import REINFORCE
 
 Settings = dict[str, Any]
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "finite_difference": FiniteDifference}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "reinforce": REINFORCE,
+    "reinforce_lstm": RecurrentREINFORCE,
+    "finite_difference": FiniteDifference,
+}
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 # The keys that the Zoo reads itself, and the arguments that it passes itself
 ZOO_KEYS = {
     "n_timesteps", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack", "env_kwargs",
     "monitor_kwargs",
 }  # fmt: skip
-ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
 LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
 
 
@@ -42,7 +47,7 @@ class ConfigurationError(ValueError):
 
 class Experiment(exp_manager.ExperimentManager):
     """
-    The Zoo's ``ExperimentManager`` for ``reinforce`` and ``finite_difference``.
+    The Zoo's ``ExperimentManager`` for ``reinforce``, ``reinforce_lstm`` and ``finite_difference``.
 
     Without the keyword ``config`` the settings are read from ``HYPERPARAMS``, or from the model whose training
     continues. The default entry is fitted to the spaces of the environment. Trial 0 of a study counts as a trial. A
@@ -165,19 +170,25 @@ def fit_default(default: Settings, experiment: Experiment) -> Settings:
     if isinstance(env.action_space, spaces.Box):
         fitted.pop("temperature", None)
     if isinstance(space, spaces.Dict):
-        fitted["policy"] = "MultiInputPolicy"
+        fitted["policy"] = "MultiInputLstmPolicy" if experiment.algo == "reinforce_lstm" else "MultiInputPolicy"
     return fitted
+
+
+def arguments_of(algorithm: str) -> dict[str, inspect.Parameter]:
+    """The arguments of an algorithm, with those that it hands on to the one that it extends."""
+    algorithms = [cls for cls in reversed(ALGORITHMS[algorithm].__mro__) if cls in ALGORITHMS.values()]
+    return {name: each for cls in algorithms for name, each in inspect.signature(cls).parameters.items()}
 
 
 def allowed_keys(algorithm: str) -> set[str]:
     """The keys that an algorithm's entry in a configuration may have."""
-    return inspect.signature(ALGORITHMS[algorithm]).parameters.keys() - ZOO_ARGUMENTS | ZOO_KEYS
+    return arguments_of(algorithm).keys() - ZOO_ARGUMENTS | ZOO_KEYS
 
 
 def scheduled_keys(algorithm: str) -> set[str]:
     """The arguments of an algorithm that may be schedules."""
-    parameters = inspect.signature(ALGORITHMS[algorithm]).parameters.values()
-    return {parameter.name for parameter in parameters if Schedule in get_args(parameter.annotation)}
+    arguments = arguments_of(algorithm)
+    return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
 
 
 def closest(name: str, names: Iterable[str]) -> str:

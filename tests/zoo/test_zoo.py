@@ -35,8 +35,8 @@ def folder(tmp_path_factory):
 def test_train_finds_the_settings_without_a_conf_file(name, folder):
     run = folder / "logs" / name / RUN
     own = HYPERPARAMS if name in ALGORITHMS else Path(rl_zoo3.__file__).parent / "hyperparams"
-    published = yaml.safe_load((own / f"{name}.yml").read_text())["CartPole-v1"]
-    assert config_of(run) == published
+    published = yaml.safe_load((own / f"{name}.yml").read_text())
+    assert config_of(run) == published.get("CartPole-v1", published.get("default"))
     assert {"CartPole-v1.zip", "best_model.zip", "evaluations.npz"} <= {path.name for path in run.iterdir()}
 
 
@@ -118,11 +118,12 @@ getattr(importlib.import_module(module), function)()
 
 
 def test_without_the_zoo_its_models_load_and_its_bridge_says_what_to_install(tmp_path):
-    for name in ALGORITHMS:
+    names = ("reinforce", "finite_difference")
+    for name in names:
         train(name, "-n", "64", "-f", str(tmp_path), "--eval-freq", "-1", "-params", "learning_rate:'lin_5E-1'")
     pyproject = (Path(__file__).parents[2] / "pyproject.toml").read_text()
     console_script = pyproject.partition('sb3-reinforce-zoo = "')[2].partition('"')[0]
-    models = [str(tmp_path / name / RUN / "CartPole-v1.zip") for name in ALGORITHMS]
+    models = [str(tmp_path / name / RUN / "CartPole-v1.zip") for name in names]
     command = [sys.executable, "-W", "ignore", "-c", WITHOUT_ZOO, console_script, *models]
     result = subprocess.run(command, capture_output=True, text=True)
     *rates, sentence = result.stdout.splitlines()[-3:]

@@ -17,11 +17,14 @@ from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
+    "reinforce_lstm": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
     "finite_difference": {"learning_rate", "delta_std"},
 }
+POLICIES = {"reinforce": "MlpPolicy", "reinforce_lstm": "MlpLstmPolicy", "finite_difference": "MlpPolicy"}
 # Settings that go with none of those published for CartPole-v1
 OTHER = {
     "reinforce": {"baseline": "leave_one_out", "n_steps": None, "n_episodes": 8, "gae_lambda": 1.0},
+    "reinforce_lstm": {"baseline": "none", "n_steps": None, "n_episodes": 4, "gae_lambda": 1.0},
     "finite_difference": {"estimator": "forward", "n_delta": 3, "delta_std": 0.2},
 }
 
@@ -52,7 +55,7 @@ def make_dicts():
     return gym.wrappers.TransformObservation(env, lambda obs: {"obs": obs, "one": 1}, space)
 
 
-@pytest.mark.parametrize(("env", "changed"), [("FrozenLake-v1", {}), ("Dicts-v0", {"policy": "MultiInputPolicy"})])
+@pytest.mark.parametrize(("env", "changed"), [("FrozenLake-v1", {}), ("Dicts-v0", {"policy": "MultiInput{}"})])
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_published_default_fits_observations_that_cannot_be_normalized(
     name, env, changed, tmp_path, monkeypatch, capsys
@@ -63,6 +66,7 @@ def test_the_published_default_fits_observations_that_cannot_be_normalized(
     train(name, *common, "--eval-freq", "-1", env=env)
     published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())["default"]
     assert published.pop("normalize")
+    changed = {key: value.format(POLICIES[name].removeprefix("Mlp")) for key, value in changed.items()}
     assert config_of(tmp_path / name / f"{env}_1") == published | changed
     zoo("enjoy", "--algo", name, "--env", env, *common, "--no-render")
     assert "Mean reward: " in capsys.readouterr().out
@@ -71,7 +75,7 @@ def test_the_published_default_fits_observations_that_cannot_be_normalized(
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_argument_that_may_be_a_schedule_may_fall(name, tmp_path):
     entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1")
-    entry = {"policy": "MlpPolicy", "n_timesteps": 64, **({"n_delta": 2} if "delta_std" in entry else {}), **entry}
+    entry |= {"policy": POLICIES[name], "n_timesteps": 64} | ({"n_delta": 2} if "delta_std" in entry else {})
     train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
     model = load(tmp_path / name / RUN)
     for key in SCHEDULED[name]:
@@ -84,7 +88,7 @@ def test_every_argument_that_may_be_a_schedule_may_fall(name, tmp_path):
 def test_a_model_goes_on_with_its_own_settings(name, tmp_path):
     params = [f"{key}:{value!r}" for key, value in OTHER[name].items()]
     common = ("-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), "-params")
-    train(name, *common, *params, "policy:'MlpPolicy'", "policy_kwargs:dict(net_arch=[5])")
+    train(name, *common, *params, f"policy:{POLICIES[name]!r}", "policy_kwargs:dict(net_arch=[5])")
     before = load(tmp_path / name / RUN)
     # With a rate of 0 what is saved is what was loaded
     train(name, "-i", str(tmp_path / name / RUN / "CartPole-v1.zip"), *common, "learning_rate:0.0")
@@ -126,7 +130,8 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
     for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
-        fixed = {key: published[entry][key] for key in ("policy", "estimator", "n_top") if key in published[entry]}
+        settings = published.get(entry, published["default"])
+        fixed = {key: settings[key] for key in ("policy", "estimator", "n_top") if key in settings}
         for _ in range(20):
             trial = study.ask()
             sample = HYPERPARAMS_SAMPLER[name](trial, 1, 8, {})

@@ -1,0 +1,224 @@
+"""
+Recurrent policies on whole sequences: one sequence is one episode, or its part within a fixed rollout.
+
+Such a policy is evaluated on rows: the observation, the number of the sequence that the row belongs to, and the state
+from which that sequence starts. Rows of one sequence stand in the order of time, so whatever selects whole sequences
+from a batch of rows selects a batch of rows. Sequences are padded and not packed, which takes half the time on a CPU;
+the padding follows the end of a sequence, where nothing depends on it.
+"""
+
+from collections.abc import Iterator
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from torch import nn
+from torch.nn.utils.rnn import pack_padded_sequence
+from torch.utils.checkpoint import checkpoint
+
+# "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
+# hidden and cell state, unless all sequences start from zero
+Rows: TypeAlias = dict[str, Any]
+State: TypeAlias = tuple[th.Tensor, th.Tensor]
+
+
+class GRU(nn.GRU):
+    """A GRU (Cho et al., 2014) with the interface of an LSTM: both halves of its state are the hidden state."""
+
+    def forward(self, x: th.Tensor, state: State | None = None) -> tuple[th.Tensor, State]:  # type: ignore[override]
+        outputs, hidden = super().forward(x, None if state is None else state[0])
+        return outputs, (hidden, hidden)
+
+
+class RNN(nn.RNN):
+    """An Elman network (1990) with the interface of an LSTM: both halves of its state are the hidden state."""
+
+    def forward(self, x: th.Tensor, state: State | None = None) -> tuple[th.Tensor, State]:  # type: ignore[override]
+        outputs, hidden = super().forward(x, None if state is None else state[0])
+        return outputs, (hidden, hidden)
+
+
+MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
+# Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
+FLOATS = 2**24
+GATES = 8
+LSTM_ARGUMENTS = ("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_kwargs")
+
+
+class RecurrentPolicy(ActorCriticPolicy):
+    """
+    What sb3-contrib's recurrent policies lack: a choice of memories, and log π and V of whole sequences.
+
+    It is mixed into one of their classes.
+    """
+
+    lstm_actor: Any
+    lstm_critic: Any
+    critic: Any
+    lstm_hidden_state_shape: tuple[int, int, int]
+
+    def __init__(self, *args: Any, memory: str = "lstm", **kwargs: Any):
+        if memory not in MEMORIES:
+            raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory!r}")
+        if kwargs.get("shared_lstm") and kwargs.get("enable_critic_lstm", True):
+            raise ValueError("shared_lstm=True needs enable_critic_lstm=False: its critic reads the actor's memory")
+        super().__init__(*args, **kwargs)
+        self.memory = memory
+        self.memory_arguments = {name: kwargs[name] for name in LSTM_ARGUMENTS if name in kwargs}
+        n_layers, _, n_hidden = self.lstm_hidden_state_shape
+        for name in ("lstm_actor", "lstm_critic"):
+            if getattr(self, name) is not None:
+                options = kwargs.get("lstm_kwargs") or {}
+                recurrence = MEMORIES[memory](self.features_dim, n_hidden, num_layers=n_layers, **options)
+                if self.ortho_init:
+                    initialize(recurrence)
+                setattr(self, name, recurrence)
+        rate = self.optimizer.param_groups[0]["lr"]
+        self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        # sb3-contrib leaves them out, and a policy that is loaded would have other shapes
+        return super()._get_constructor_parameters() | self.memory_arguments | {"memory": self.memory}
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions and the next state; the state is checked first."""
+        if state is not None:
+            obs, _ = self.obs_to_tensor(observation)
+            n_layers, _, n_hidden = self.lstm_hidden_state_shape
+            n_envs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
+            shapes = [np.shape(part) for part in state]
+            if shapes != [(n_layers, n_envs, n_hidden)] * 2:
+                raise ValueError(
+                    f"state must be the one that predict returned for these {n_envs} environments, two arrays of shape "
+                    f"{(n_layers, n_envs, n_hidden)}, or None where episodes start; got arrays of shapes {shapes}"
+                )
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def zero_state(self, n_envs: int) -> th.Tensor:
+        """The state at the start of an episode, shape ``(n_envs, 2, 2, n_layers, n_hidden)``."""
+        n_layers, _, n_hidden = self.lstm_hidden_state_shape
+        return self.value_net.weight.new_zeros(n_envs, 2, 2, n_layers, n_hidden)
+
+    def sequence_distribution(self, rows: Rows) -> Distribution:
+        """π(·|o_0, ..., o_t) for each of n rows."""
+        latent = self.mlp_extractor.forward_actor(self.actor_memory(rows))
+        return self._get_action_dist_from_latent(latent)
+
+    def sequence_values(self, rows: Rows) -> th.Tensor:
+        """V(o_0, ..., o_t) for each of n rows, shape ``(n, 1)``."""
+        if self.lstm_critic is not None:
+            latent = self.remember(
+                self.lstm_critic, self.row_features(rows, self.vf_features_extractor), rows, critic=True
+            )
+        elif self.critic is not None:
+            latent = self.critic(self.row_features(rows, self.vf_features_extractor))
+        else:
+            latent = self.actor_memory(rows).detach()
+        return cast(th.Tensor, self.value_net(self.mlp_extractor.forward_critic(latent)))
+
+    def actor_memory(self, rows: Rows) -> th.Tensor:
+        """The actor's memory after each of n rows, shape ``(n, n_hidden)``."""
+        return self.remember(self.lstm_actor, self.row_features(rows, self.pi_features_extractor), rows, critic=False)
+
+    def row_features(self, rows: Rows, extractor: nn.Module) -> th.Tensor:
+        """The features of n rows, without padding."""
+        return BasePolicy.extract_features(self, rows["observations"], extractor)  # type: ignore[arg-type]
+
+    def remember(self, recurrence: nn.RNNBase, features: th.Tensor, rows: Rows, critic: bool) -> th.Tensor:
+        """The outputs of a recurrent network for n rows of sequences, shape ``(n, n_hidden)``."""
+        index, is_row = padded_index(rows["sequence"])
+        state = initial_state(rows, index[0], critic)
+        n_at_once = max(1, FLOATS // (GATES * index.shape[1] * recurrence.hidden_size))
+        if len(index) <= n_at_once:
+            outputs, _ = recurrence(features[index], state)
+        else:
+            # The gates of long episodes are computed again for the backward pass: its gradient is exact, in less memory
+            parts = []
+            for part in th.split(index, n_at_once):
+                output, state = checkpoint(recurrence, features[part], state, use_reentrant=False)
+                parts.append(output)
+            outputs = th.cat(parts)
+        return th.empty_like(outputs[is_row]).index_copy(0, index[is_row], outputs[is_row])
+
+    @th.no_grad()
+    def state_after(self, rows: Rows) -> th.Tensor:
+        """The critic's state after the last row of each sequence, shape ``(n_sequences, 2, n_layers, n_hidden)``."""
+        features = self.row_features(rows, self.vf_features_extractor)
+        index, is_row = padded_index(rows["sequence"])
+        packed = pack_padded_sequence(features[index], is_row.sum(0).cpu(), enforce_sorted=False)
+        _, state = self.lstm_critic(packed, initial_state(rows, index[0], critic=True))
+        return th.stack(state).permute(2, 0, 1, 3)
+
+
+def initialize(recurrence: nn.RNNBase) -> None:
+    """Orthogonal weights for each gate, as Stable-Baselines3's other layers have, and zero biases."""
+    for name, parameter in recurrence.named_parameters():
+        if name.startswith("weight"):
+            for gate in th.split(parameter.data, recurrence.hidden_size):
+                nn.init.orthogonal_(gate)
+        else:
+            nn.init.zeros_(parameter)
+
+
+def padded_index(sequence: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """The row at each place of padded sequences, shape ``(length, n_sequences)``, and which places are no padding."""
+    order = sequence.argsort(stable=True)
+    lengths = th.unique_consecutive(sequence[order], return_counts=True)[1]
+    places = th.arange(int(lengths.max()), device=sequence.device)[:, None]
+    is_row = places < lengths
+    index = order[(lengths.cumsum(0) - lengths + places).clamp(max=len(order) - 1)]
+    return index, is_row
+
+
+def initial_state(rows: Rows, first: th.Tensor, critic: bool) -> State | None:
+    """The hidden and the cell state at the first rows, each ``(n_layers, n_sequences, n_hidden)``; None for zeros."""
+    if "state" not in rows:
+        return None
+    hidden, cell = rows["state"][first][:, int(critic)].permute(1, 2, 0, 3).contiguous()
+    return hidden, cell
+
+
+def episode_numbers(dones: th.Tensor) -> th.Tensor:
+    """The number of the episode that each step belongs to, from 0 on, shape ``(n_steps, n_envs)``, int64."""
+    ended_before = dones.long().cumsum(0) - dones.long()
+    n_episodes = ended_before[-1] + 1
+    return ended_before + n_episodes.cumsum(0) - n_episodes
+
+
+def rows_of(obs: Any, dones: th.Tensor, state: th.Tensor | None) -> Rows:
+    """
+    The rows of a rollout, each tensor starting with ``(n_steps, n_envs)``.
+
+    ``state`` is the one from which the first steps went on, shape ``(n_envs, 2, 2, n_layers, n_hidden)``.
+    """
+    sequence = episode_numbers(dones)
+    rows: Rows = {"observations": obs, "sequence": sequence}
+    if state is not None:
+        goes_on = sequence == sequence[0]
+        rows["state"] = state * goes_on[(...,) + (None,) * 4]
+    return rows
+
+
+def without_memory(rows: Rows) -> Rows:
+    """The rows, each as a sequence of one step."""
+    return {**rows, "sequence": th.arange(len(rows["sequence"]), device=rows["sequence"].device)}
+
+
+def sequence_minibatches(sequence: th.Tensor, size: int) -> Iterator[th.Tensor]:
+    """Rows of whole sequences, drawn without replacement, about ``size`` at a time and at least one sequence."""
+    _, number, lengths = th.unique(sequence, return_inverse=True, return_counts=True)
+    order = th.randperm(len(lengths)).to(sequence.device)
+    batch = th.empty_like(order)
+    batch[order] = (lengths[order].cumsum(0) - 1) // size
+    for each in range(int(batch.max()) + 1):
+        rows = (batch[number] == each).nonzero().flatten()
+        if len(rows):
+            yield rows

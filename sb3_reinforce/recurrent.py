@@ -1,0 +1,152 @@
+"""REINFORCE with a memory, for tasks in which one observation does not say enough."""
+
+from typing import Any, ClassVar, cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
+from sb3_reinforce.estimation import Rollout
+from sb3_reinforce.policies.evaluation import Route
+from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
+from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
+from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.sampling.collection import Bools, TerminalObs
+from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
+
+__all__ = ["CnnLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
+
+
+class RecurrentREINFORCE(REINFORCE):
+    """
+    REINFORCE with the recurrent policies of sb3-contrib (Wierstra et al., 2010, "Recurrent Policy Gradients").
+
+    By default a rollout is a number of whole episodes, and its gradient is exact: it is propagated back through each
+    complete episode, and no state is older than the parameters. In fixed rollouts (``n_steps``) the state is carried
+    on, and the gradient is cut where the rollout starts, as in every other implementation. V at a time limit or at a
+    cut comes from one more step of its sequence. The critic's minibatches are whole sequences of about ``batch_size``
+    steps.
+
+    ``policy_kwargs`` are those of sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
+    ``shared_lstm``, ``lstm_kwargs``; ``memory`` is ``"lstm"``, ``"gru"`` or ``"rnn"``.
+
+    To predict, hand the state on; without it each call starts an episode:
+
+        >>> state, episode_start = None, np.ones(1, dtype=bool)  # doctest: +SKIP
+        >>> action, state = model.predict(obs, state, episode_start)  # doctest: +SKIP
+
+    :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy or a subclass of one of them
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
+    :param n_episodes: Whole episodes per rollout; 16 if ``n_steps`` is None too
+    :param batch_size: Steps per minibatch of the critic, at least one whole sequence
+    :param kwargs: All other arguments of :class:`~sb3_reinforce.REINFORCE`
+    :raises TypeError: If an argument is of the wrong type
+    :raises ValueError: If an argument is out of its range, or the policy has no memory
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpLstmPolicy": MlpLstmPolicy,
+        "CnnLstmPolicy": CnnLstmPolicy,
+        "MultiInputLstmPolicy": MultiInputLstmPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[RecurrentPolicy],
+        env: GymEnv | str,
+        *,
+        n_steps: int | None = None,
+        n_episodes: int | None = None,
+        batch_size: int = 4096,
+        **kwargs: Any,
+    ):
+        if n_steps is None and n_episodes is None:
+            n_episodes = 16
+        self._actor: RecurrentActor | None = None
+        self._next_state: th.Tensor | None = None
+        super().__init__(policy, env, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs)
+
+    def _check_policy(self, policy: str | type) -> None:
+        if isinstance(policy, str):
+            super()._check_policy(policy)
+        elif not issubclass(policy, RecurrentPolicy):
+            raise ValueError(
+                f"policy must be one of {', '.join(self.policy_aliases)} of sb3_reinforce.recurrent or a subclass, got "
+                f"{policy.__name__}"
+            )
+
+    def _excluded_save_params(self) -> list[str]:
+        # The environments are reset after loading
+        return [*super()._excluded_save_params(), "_actor", "_state", "_next_state"]
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
+    ) -> bool:
+        """
+        Collect a rollout as :class:`~sb3_reinforce.REINFORCE` does, and keep the states that the next one goes on from.
+
+        :param env: The training environment
+        :param callback: Called at each step, and at the beginning and end of the rollout
+        :param rollout_buffer: Filled as by A2C
+        :param n_rollout_steps: Steps per environment, None for whole episodes
+        :return: False if the callback stopped the collection
+        :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
+        """
+        self._actor = None
+        is_complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        self._next_state = self._state_after_rollout() if is_complete and n_rollout_steps is not None else None
+        return is_complete
+
+    def _make_actor(self, route: Route, keep_outputs: bool) -> RecurrentActor:
+        policy = cast(RecurrentPolicy, self.policy)
+        if self._actor is not None:
+            # A callback has changed the policy during the rollout
+            state = self._actor.state()
+        else:
+            starts = th.as_tensor(self._last_episode_starts, device=self.device)
+            self._state = None
+            if self._next_state is not None and not starts.all():
+                self._state = self._next_state * ~starts[(...,) + (None,) * 4]
+            state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
+        self._actor = make_recurrent_actor(policy, state, lambda: cast(Bools, self._last_episode_starts), keep_outputs)
+        return self._actor
+
+    def _state_after_rollout(self) -> th.Tensor:
+        """The states at the cut; the critic's is computed from the rollout, since only the actor acts."""
+        policy = cast(RecurrentPolicy, self.policy)
+        rollout = cast(Rollout, self.rollout)
+        state = policy.zero_state(self.n_envs)
+        state[:, 0] = cast(RecurrentActor, self._actor).state()
+        if rollout.values is not None and policy.lstm_critic is not None:
+            state[:, 1] = policy.state_after(select(rollout.inputs, rollout.episodes == rollout.episodes[-1]))
+        return state
+
+    @th.no_grad()
+    def _evaluate_critic(
+        self, route: Route, buffer: RolloutBuffer, dones: Bools, terminal_obs: TerminalObs
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
+        policy = cast(RecurrentPolicy, self.policy)
+        rows = rows_of(
+            obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), self._state
+        )
+        n_steps, n_envs = dones.shape
+        steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T
+        following = take(rows, (steps, envs))
+        observed = [self._last_obs, *(stack([obs]) for obs in terminal_obs.values())]
+        following["observations"] = concatenate(*(shaped_like(following["observations"], obs) for obs in observed))
+        # An episode that has ended with the rollout does not go on in the next observation, whose V is not asked for
+        following["sequence"][:n_envs][th.as_tensor(dones[-1])] = -1
+        values = policy.sequence_values(concatenate(flatten(rows), following)).flatten().cpu().numpy()
+        after = values[n_steps * n_envs :]
+        values = values[: n_steps * n_envs].reshape(dones.shape)
+        next_values = np.where(dones, 0.0, np.vstack([values[1:], after[:n_envs]]))
+        next_values[steps[n_envs:], envs[n_envs:]] = after[n_envs:]
+        return values, next_values

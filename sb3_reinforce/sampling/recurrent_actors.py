@@ -1,0 +1,136 @@
+"""How a recurrent policy acts while a rollout is collected: an LSTM of one layer by NumPy, else by its own methods."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.utils import obs_as_tensor
+from torch import nn
+
+from sb3_reinforce.policies.evaluation import route_of
+from sb3_reinforce.policies.plain_mlp import HOOKS, has_numpy_form, is_unchanged, plain_actor, takes_vectors
+from sb3_reinforce.policies.sequences import RecurrentPolicy
+from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
+
+Bools: TypeAlias = NDArray[np.bool_]
+# Which of the environments start an episode with the observation at hand
+Starts: TypeAlias = Callable[[], Bools]
+
+
+class RecurrentPolicyActor(PolicyActor):
+    """Acts by the policy's own methods, from a state of shape ``(n_envs, 2, n_layers, n_hidden)``."""
+
+    def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool):
+        super().__init__(policy, route_of(policy))
+        self.starts = starts
+        self.keep_outputs = keep_outputs
+        self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
+        self.log_probs: list[np.ndarray] = []
+
+    @th.no_grad()
+    def act(self, obs: Any) -> Acted:
+        """Draw actions for observations of ``n_envs`` environments."""
+        policy: Any = self.policy
+        episode_starts = th.as_tensor(self.starts(), dtype=th.float32, device=policy.device)
+        distribution, self.halves = policy.get_distribution(
+            obs_as_tensor(obs, policy.device), self.halves, episode_starts
+        )
+        actions = distribution.get_actions()
+        if self.keep_outputs:
+            self.log_probs.append(distribution.log_prob(actions).cpu().numpy())
+        return actions.cpu().numpy().reshape(-1, *self.shape), None, None
+
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+        """log π of the steps, as they were drawn, shape ``(n_steps * n_envs,)``."""
+        return np.concatenate(self.log_probs)
+
+    def state(self) -> th.Tensor:
+        """The actor's state after its last step, shape ``(n_envs, 2, n_layers, n_hidden)``."""
+        return th.stack(self.halves).permute(2, 0, 1, 3)
+
+    def is_current(self, policy: Any) -> bool:
+        """Whether the policy would still act as this actor does."""
+        return policy is self.policy and make_head(policy) is None
+
+
+class LstmActor(NumpyActor):
+    """Acts by NumPy, for an LSTM of one layer between flat observations and a plain MLP."""
+
+    def __init__(
+        self, policy: RecurrentPolicy, layers: list[nn.Module], state: th.Tensor, starts: Starts, keep_outputs: bool
+    ):
+        super().__init__(policy, layers, len(state), keep_outputs)
+        self.starts = starts
+        self.lstm = policy.lstm_actor
+        self.cell = LstmCell(self.lstm, state)
+        self.lstm_addresses = [parameter.data_ptr() for parameter in self.lstm.parameters()]
+        self.dicts += [vars(self.lstm), *(vars(self.lstm)[name] for name in HOOKS)]
+        self.n_entries = sum(map(len, self.dicts))
+
+    def act(self, obs: Any) -> Acted:
+        return super().act(self.cell.step(obs, self.starts()))
+
+    def state(self) -> th.Tensor:
+        """The actor's state after its last step, shape ``(n_envs, 2, 1, n_hidden)``."""
+        return th.as_tensor(np.stack([self.cell.hidden, self.cell.cell], axis=1)[:, :, None])
+
+    def is_current(self, policy: Any) -> bool:
+        addresses = [parameter.data_ptr() for parameter in policy.lstm_actor.parameters()]
+        return super().is_current(policy) and policy.lstm_actor is self.lstm and addresses == self.lstm_addresses
+
+
+class LstmCell:
+    """An LSTM of one layer for ``n_envs`` environments; its weights are views of the parameters."""
+
+    def __init__(self, lstm: Any, state: th.Tensor):
+        self.hidden, self.cell = (half.numpy().copy() for half in state[:, :, 0].unbind(1))
+        self.weights = [parameter.detach().numpy() for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
+        self.biases = [parameter.detach().numpy() for parameter in (lstm.bias_ih_l0, lstm.bias_hh_l0)]
+        n_hidden = lstm.hidden_size
+        # σ(x) = ½ tanh(½ x) + ½ for three gates, and tanh itself for g
+        self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), n_hidden)
+        self.shift = 1 - self.scale
+
+    @np.errstate(all="ignore")
+    def step(self, obs: np.ndarray, starts: Bools) -> Any:
+        """
+        The hidden state after observations of ``n_envs`` environments, shape ``(n_envs, n_hidden)``.
+
+        ``i, f, g, o = W_ih x + W_hh h + b``, then ``c ← σ(f) c + σ(i) tanh g`` and ``h ← σ(o) tanh c`` (Hochreiter and
+        Schmidhuber, 1997, with the forget gate of Gers et al., 2000).
+        """
+        if np.count_nonzero(starts):
+            self.hidden[starts] = 0
+            self.cell[starts] = 0
+        x = obs.reshape(len(starts), -1).astype(np.float32, copy=False)
+        gates = x @ self.weights[0].T + self.hidden @ self.weights[1].T + self.biases[0] + self.biases[1]
+        i, f, g, o = np.split(np.tanh(gates * self.scale) * self.scale + self.shift, 4, axis=1)
+        self.cell = f * self.cell + i * g
+        self.hidden = o * np.tanh(self.cell)
+        return self.hidden
+
+
+RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor
+
+
+def make_recurrent_actor(
+    policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool
+) -> RecurrentActor:
+    """The fastest actor that acts as the policy would."""
+    layers = make_head(policy)
+    if layers is not None:
+        return LstmActor(policy, layers, state, starts, keep_outputs)
+    return RecurrentPolicyActor(policy, state, starts, keep_outputs)
+
+
+def make_head(policy: Any) -> list[nn.Module] | None:
+    """The layers after an LSTM that NumPy can compute, or None."""
+    layers = plain_actor(policy, RecurrentPolicy)
+    lstm = policy.lstm_actor
+    if layers is None or not has_numpy_form(layers) or not takes_vectors(policy, policy.pi_features_extractor):
+        return None
+    is_plain = type(lstm) is nn.LSTM and is_unchanged(lstm) and lstm.num_layers == 1 and lstm.proj_size == 0
+    is_plain = is_plain and lstm.bias and not lstm.bidirectional and lstm.weight_ih_l0.dtype is th.float32
+    return layers if is_plain else None

@@ -1,0 +1,245 @@
+"""RecurrentREINFORCE: exact gradients through whole episodes, V where they are cut, states that are carried on."""
+
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from callbacks import Record
+from enumeration import ARGUMENTS
+from environments import Corridor, Random
+from gymnasium import spaces
+from models import plain
+from recurrent_models import SPACES, by_steps, make_recurrent
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.common.tensors import stack, take
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation.rollout import Running
+from sb3_reinforce.estimation.weights import complete_rollout
+from sb3_reinforce.recurrent import RecurrentREINFORCE
+
+GAMMA = 0.5
+# float32 holds them exactly
+REWARDS = np.random.default_rng(0).integers(-8, 8, (2, 2, 2)) / 4
+FIRST_REWARDS = np.random.default_rng(1).integers(-8, 8, (2, 2)) / 4
+
+
+class Cue(gym.Env):
+    """A cue is seen in the first of two steps, and what the second action is worth depends on it."""
+
+    observation_space = spaces.Box(0, 1, (3,))
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(0), {}
+
+    def step(self, action):
+        return self.observe(None), 0.0, True, False, {}
+
+    @staticmethod
+    def observe(cue):
+        return np.eye(3, dtype=np.float32)[2 if cue is None else cue]
+
+
+def log_p(policy, cue, actions):
+    """log p(τ), with π by sb3-contrib's own methods."""
+    obs = np.stack([Cue.observe(cue), Cue.observe(None)])[:, None]
+    logits, _ = by_steps(policy, obs, np.array([[False], [True]]), policy.zero_state(1))
+    return np.log(0.5) + logits.log_softmax(1)[range(2), list(actions)].sum()
+
+
+def rewards_of(cue, actions):
+    return FIRST_REWARDS[cue, actions[0]], REWARDS[cue, actions[0], actions[1]]
+
+
+def estimate(model, batch):
+    """ĝ, as ``train`` steps along it, for episodes side by side."""
+    buffer = RolloutBuffer(2, model.observation_space, model.action_space, "cpu", n_envs=len(batch))
+    for i, (cue, actions) in enumerate(batch):
+        buffer.observations[:, i] = np.stack([Cue.observe(cue), Cue.observe(None)])
+        buffer.actions[:, i, 0] = actions
+        buffer.rewards[:, i] = rewards_of(cue, actions)
+    dones = np.array([[False] * len(batch), [True] * len(batch)])
+    buffer.full = True
+    model.rollout_buffer = buffer
+    model.rollout = complete_rollout(
+        buffer,
+        model.policy,
+        dones,
+        np.ones(len(batch), dtype=int),
+        Running.none(len(batch)),
+        None,
+        baseline=BASELINES[model.baseline],
+        **{name: getattr(model, name) for name in ARGUMENTS},
+    )
+    before = th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
+    model.train()
+    step = th.nn.utils.parameters_to_vector(model.policy.parameters()).detach() - before
+    th.nn.utils.vector_to_parameters(before, model.policy.parameters())
+    return step
+
+
+@pytest.mark.parametrize("baseline", ["none", "leave_one_out"])
+@pytest.mark.parametrize("network", [{}, {"n_lstm_layers": 2}, {"memory": "gru"}], ids=str)
+def test_the_expected_gradient_is_that_of_the_return(network, baseline):
+    """By enumeration of all pairs of episodes of a task whose second observation says nothing."""
+    model = make_recurrent(
+        env=Cue(),
+        n_episodes=2,
+        gamma=GAMMA,
+        discount_scores=True,
+        normalize_by="episodes",
+        baseline=baseline,
+        learning_rate=1.0,
+        max_grad_norm=None,
+        policy_kwargs={"optimizer_class": th.optim.SGD, "lstm_hidden_size": 2, "net_arch": [], **network},
+    )
+    model._setup_learn(1)
+    model._current_progress_remaining = 1.0
+    episodes = list(product((0, 1), product((0, 1), repeat=2)))
+    log_ps = [log_p(model.policy, *episode) for episode in episodes]
+    returns = [np.dot(rewards_of(*episode), (1, GAMMA)) for episode in episodes]
+    expected_return = sum(log_p.exp() * g for log_p, g in zip(log_ps, returns, strict=True))
+    gradients = th.autograd.grad(
+        expected_return, list(model.policy.parameters()), materialize_grads=True, allow_unused=True
+    )
+    expected = th.nn.utils.parameters_to_vector(gradients)
+    estimated = th.zeros_like(expected)
+    for pair in product(range(len(episodes)), repeat=2):
+        p = sum(log_ps[i] for i in pair).exp().item()
+        estimated += p * estimate(model, [episodes[i] for i in pair])
+    assert expected.norm() > 0.01
+    th.testing.assert_close(estimated, expected, rtol=0, atol=1e-10)
+
+
+class Ends(Record):
+    """The last observation of each episode, by its last step (counted from the start of training) and environment."""
+
+    def __init__(self):
+        super().__init__(lambda model: None, at="step")
+        self.found = {}
+
+    def _on_step(self) -> bool:
+        for env, info in enumerate(self.locals["infos"]):
+            if self.locals["dones"][env]:
+                obs = info["terminal_observation"] if info["TimeLimit.truncated"] else None
+                self.found[self.n_calls - 1, env] = obs
+        return True
+
+
+@th.no_grad()
+def value_of(policy, episode):
+    """V after a list of observations, by sb3-contrib's own methods."""
+    if isinstance(episode[0], dict):
+        # A rollout buffer holds a Discrete observation as an array, and the environment returns a number
+        episode = [{key: np.ravel(part) for key, part in obs.items()} for obs in episode]
+    obs = stack(episode)
+    obs = {key: part[:, None] for key, part in obs.items()} if isinstance(obs, dict) else obs[:, None]
+    return float(by_steps(policy, obs, np.zeros((len(episode), 1), dtype=bool), policy.zero_state(1))[1][-1])
+
+
+@pytest.mark.parametrize("name", SPACES)
+@pytest.mark.parametrize("truncate", [False, True])
+@pytest.mark.parametrize("n_steps", [4, None])
+def test_values_are_those_of_one_step_at_a_time(n_steps, truncate, name):
+    """Also after time limits, and where a rollout cuts an episode that began in one before."""
+    env = make_vec_env(lambda: Random(SPACES[name], lengths=(2, 5, 9), truncate=truncate), 2, seed=0)
+    model = make_recurrent(name, env, n_steps=n_steps, n_episodes=None if n_steps else 4, learning_rate=0.0)
+    records = Record(lambda model: (model.rollout, model._last_obs))
+    values = []
+    evaluate_critic = model._evaluate_critic
+    model._evaluate_critic = lambda *args: values.append(evaluate_critic(*args)) or values[-1]
+    ends = Ends()
+    model.learn(40, [records, ends])
+    first = 0
+    running = [[], []]
+    for (rollout, last_obs), (own, own_next) in zip(records.records, values, strict=True):
+        for t, env in product(range(len(rollout.dones)), range(2)):
+            running[env].append(take(rollout.observations, (t, env)))
+            assert own[t, env] == pytest.approx(value_of(model.policy, running[env]), abs=1e-6)
+            is_last = bool(rollout.dones[t, env])
+            if is_last:
+                following = ends.found[first + t, env]
+            else:
+                after = take(rollout.observations, t + 1) if t + 1 < len(rollout.dones) else last_obs
+                following = take(after, env)
+            expected = 0.0 if following is None else value_of(model.policy, [*running[env], following])
+            if rollout.used[t, env]:
+                assert own_next[t, env] == pytest.approx(expected, abs=1e-6)
+            if is_last:
+                running[env] = []
+        first += len(rollout.dones)
+        if n_steps is None:
+            running = [[], []]
+
+
+@pytest.mark.parametrize("n_steps", [8, None])
+def test_saving_and_going_on_is_never_having_stopped(n_steps, tmp_path):
+    ends = []
+    for stops in (False, True):
+        env = make_vec_env("CartPole-v1", 2, seed=5)
+        model = make_recurrent(env=env, double=False, n_steps=n_steps).learn(100)
+        if stops:
+            model.save(tmp_path / "model")
+            model = RecurrentREINFORCE.load(tmp_path / "model", env, device="cpu", restore_random_state=True)
+        env.seed(7)
+        model.set_env(env)
+        model.learn(100, reset_num_timesteps=False)
+        ends.append(plain(model.get_parameters()))
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_what_users_of_stable_baselines3_call(name, tmp_path):
+    env = make_vec_env(lambda: Random(SPACES[name], lengths=(3, 5)), 2, seed=0)
+    model = make_recurrent(name, env, n_episodes=4, double=False, policy_kwargs={"n_lstm_layers": 2}).learn(20)
+    model.save(tmp_path / "model")
+    loaded = RecurrentREINFORCE.load(tmp_path / "model", env)
+    results = []
+    for each in (model, loaded):
+        env.seed(3)
+        results.append(evaluate_policy(each, env, 4, return_episode_rewards=True))
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("network", [{}, {"n_lstm_layers": 2}, {"memory": "gru"}], ids=str)
+def test_the_lab_takes_it(network):
+    env = make_vec_env(lambda: Corridor((3, 5), lambda t, action: float(t * action)), 2, seed=0)
+    model = make_recurrent(env=env, double=False, n_episodes=4, policy_kwargs=network)
+    table = check_gradient(model)
+    assert table.passed, str(table)
+    assert len(compare_baselines(model, n_episodes=4, n_resamples=50)) >= 5
+    assert RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda env: REINFORCE("MlpLstmPolicy", env), "RecurrentREINFORCE"),
+        (lambda env: RecurrentREINFORCE("MlpPolicy", env), "policy must be a class or one of .*MlpLstmPolicy"),
+        (
+            lambda env: RecurrentREINFORCE(RecurrentActorCriticPolicy, env),
+            "policy",
+        ),
+        (lambda env: RecurrentREINFORCE(REINFORCE("MlpPolicy", env).policy_class, env), "policy must be one of"),
+        (lambda env: make_recurrent(env=env, policy_kwargs={"memory": "LSTM"}), "memory must be one of lstm, gru, rnn"),
+        (lambda env: make_recurrent(env=env, policy_kwargs={"shared_lstm": True}), "shared_lstm=True needs"),
+    ],
+)
+def test_what_is_no_recurrent_policy(call, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        call(make_vec_env("CartPole-v1"))
+
+
+def test_a_state_of_other_environments():
+    model = make_recurrent(env=make_vec_env("CartPole-v1"), double=False)
+    with pytest.raises(ValueError, match=r"state must be .* two arrays of shape \(1, 3, 4\)"):
+        model.predict(np.zeros((3, 4)), (np.zeros((1, 2, 4)), np.zeros((1, 2, 4))))
