@@ -14,13 +14,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
 from sb3_reinforce.estimation import Rollout
 from sb3_reinforce.policies.evaluation import Route
-from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
+from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.collection import Bools, TerminalObs
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
-__all__ = ["CnnLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
+__all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
 
 
 class RecurrentREINFORCE(REINFORCE):
@@ -41,7 +41,7 @@ class RecurrentREINFORCE(REINFORCE):
         >>> state, episode_start = None, np.ones(1, dtype=bool)  # doctest: +SKIP
         >>> action, state = model.predict(obs, state, episode_start)  # doctest: +SKIP
 
-    :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy or a subclass of one of them
+    :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy, MaskedLstmPolicy or a subclass of one of them
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
     :param n_episodes: Whole episodes per rollout; 16 if ``n_steps`` is None too
@@ -55,6 +55,7 @@ class RecurrentREINFORCE(REINFORCE):
         "MlpLstmPolicy": MlpLstmPolicy,
         "CnnLstmPolicy": CnnLstmPolicy,
         "MultiInputLstmPolicy": MultiInputLstmPolicy,
+        "MaskedLstmPolicy": MaskedLstmPolicy,
     }
 
     def __init__(

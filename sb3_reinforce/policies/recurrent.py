@@ -4,13 +4,17 @@ The recurrent policies of sb3-contrib, as RecurrentREINFORCE trains them.
 They take the arguments of sb3-contrib's classes of the same names, and ``memory``: "lstm", "gru" or "rnn".
 """
 
+from typing import Any
+
+import torch as th
 from sb3_contrib.common.recurrent.policies import (
     RecurrentActorCriticCnnPolicy,
     RecurrentActorCriticPolicy,
     RecurrentMultiInputActorCriticPolicy,
 )
 
-from sb3_reinforce.policies.sequences import RecurrentPolicy
+from sb3_reinforce.policies.masks import MaskedPolicy, sizes_of, split_mask
+from sb3_reinforce.policies.sequences import RecurrentPolicy, Rows
 
 
 class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
@@ -23,3 +27,38 @@ class CnnLstmPolicy(RecurrentPolicy, RecurrentActorCriticCnnPolicy):
 
 class MultiInputLstmPolicy(RecurrentPolicy, RecurrentMultiInputActorCriticPolicy):
     """A recurrent policy for Dict observations."""
+
+
+class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy):
+    """A recurrent policy that takes no action which the observation forbids: see :class:`MaskedPolicy`."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.n_actions = sum(sizes_of(self.action_space))
+        if self.critic is not None:
+            self.critic = BesideMask(self.critic, self.n_actions)
+
+    def remember(self, recurrence: th.nn.RNNBase, features: th.Tensor, rows: Rows, critic: bool) -> th.Tensor:
+        """The outputs of a recurrent network for n rows of sequences, with the mask behind them."""
+        features, mask = split_mask(features, self.n_actions)
+        return th.cat([super().remember(recurrence, features, rows, critic), mask], dim=1)
+
+    def _process_sequence(  # type: ignore[override]
+        self, features: th.Tensor, lstm_states: Any, episode_starts: th.Tensor, lstm: th.nn.LSTM
+    ) -> tuple[th.Tensor, Any]:
+        features, mask = split_mask(features, self.n_actions)
+        outputs, states = super()._process_sequence(features, lstm_states, episode_starts, lstm)
+        return th.cat([outputs, mask], dim=1), states
+
+
+class BesideMask(th.nn.Module):
+    """A layer that the mask behind its inputs passes by."""
+
+    def __init__(self, layer: th.nn.Module, n_actions: int):
+        super().__init__()
+        self.layer = layer
+        self.n_actions = n_actions
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        features, mask = split_mask(features, self.n_actions)
+        return th.cat([self.layer(features), mask], dim=1)

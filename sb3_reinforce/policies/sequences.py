@@ -151,7 +151,8 @@ class RecurrentPolicy(ActorCriticPolicy):
     @th.no_grad()
     def state_after(self, rows: Rows) -> th.Tensor:
         """The critic's state after the last row of each sequence, shape ``(n_sequences, 2, n_layers, n_hidden)``."""
-        features = self.row_features(rows, self.vf_features_extractor)
+        # Behind the features a mask may stand
+        features = self.row_features(rows, self.vf_features_extractor)[:, : self.lstm_critic.input_size]
         index, is_row = padded_index(rows["sequence"])
         packed = pack_padded_sequence(features[index], is_row.sum(0).cpu(), enforce_sorted=False)
         _, state = self.lstm_critic(packed, initial_state(rows, index[0], critic=True))

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from sb3_reinforce import REINFORCE, ActionMaskObservation, FiniteDifference, GymnasiumVecEnv, MaskedPolicy
 from sb3_reinforce.diagnostics import PitfallCallback, check_gradient, compare_baselines, compare_estimators
 from sb3_reinforce.estimation import BASELINES, gradients_by_episode
+from sb3_reinforce.recurrent import MaskedLstmPolicy, RecurrentREINFORCE
 
 ALGORITHMS = {
     "reinforce": (REINFORCE, {"n_steps": 16}),
@@ -31,6 +32,7 @@ ALGORITHMS = {
     "search": (FiniteDifference, {"n_delta": 4, "estimator": "central", "deterministic": False}),
     "a2c": (A2C, {"n_steps": 16}),
     "ppo": (PPO, {"n_steps": 64, "batch_size": 64, "n_epochs": 2}),
+    "recurrent": (RecurrentREINFORCE, {"n_steps": 16}),
 }
 VECTOR = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
@@ -72,7 +74,8 @@ def environment(task="discrete", **kwargs):
 def make(algorithm, env, **kwargs):
     cls, arguments = ALGORITHMS[algorithm]
     fixed = {"seed": 0, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
-    return cls(MaskedPolicy, env, **{**fixed, **arguments, **kwargs})
+    policy = MaskedLstmPolicy if cls is RecurrentREINFORCE else MaskedPolicy
+    return cls(policy, env, **{**fixed, **arguments, **kwargs})
 
 
 def takes_only_allowed_actions(algorithm, task, n_steps, **kwargs):
@@ -92,6 +95,12 @@ algorithms = pytest.mark.parametrize("algorithm", ALGORITHMS)
 @algorithms
 def test_no_forbidden_action_is_taken(algorithm, task):
     takes_only_allowed_actions(algorithm, task, 200)
+
+
+@pytest.mark.parametrize("network", [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared_lstm": True}])
+def test_memory_and_mask_go_together_whatever_the_critic_remembers(network):
+    for n_steps in (16, None):
+        takes_only_allowed_actions("recurrent", "discrete", 200, n_steps=n_steps, policy_kwargs=network)
 
 
 @pytest.mark.slow
