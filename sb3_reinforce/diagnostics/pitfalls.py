@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -28,6 +27,7 @@ class Update:
 
     kl: float  # mean of log π_old − log π_new over steps of the rollout, at its temperature
     entropy: float  # mean entropy of the policy
+    largest_entropy: float  # of a policy that prefers no action
     std: float  # mean standard deviation of the actions of a Gaussian policy
     grad_norm: float  # before clipping
     explained_variance: float  # of the critic
@@ -175,13 +175,7 @@ def randomness(space: spaces.Space[Any], update: Update) -> float:
     """Entropy / largest entropy, or for a Box min(1, standard deviation / half the mean width); NaN if not known."""
     if isinstance(space, spaces.Box):
         return min(1.0, update.std / float((space.high - space.low).mean() / 2))
-    if isinstance(space, spaces.Discrete):
-        largest = math.log(space.n)
-    elif isinstance(space, spaces.MultiDiscrete):
-        largest = float(np.log(space.nvec).sum())
-    else:
-        largest = math.log(2) * math.prod(space.shape or ())
-    return update.entropy / largest if largest > 0 else float("nan")
+    return update.entropy / update.largest_entropy if update.largest_entropy > 0 else math.nan
 
 
 def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
@@ -190,6 +184,15 @@ def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
         return math.nan
     distribution = action_distribution(policy, obs).distribution
     return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
+
+
+def largest_entropy(policy: ActorCriticPolicy, obs: Any) -> float:
+    """The mean entropy if the policy preferred none of the actions that a mask allows; NaN where it is not known."""
+    distribution: Any = action_distribution(policy, obs).distribution
+    parts = distribution if isinstance(distribution, list) else [distribution]
+    if all(isinstance(part, th.distributions.Categorical) for part in parts):
+        return float(sum(part.logits.isfinite().sum(-1).log().mean() for part in parts))
+    return math.log(2) * math.prod(policy.action_space.shape or ())
 
 
 def temperature_of(policy: ActorCriticPolicy) -> float:

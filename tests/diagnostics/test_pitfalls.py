@@ -81,7 +81,7 @@ def test_every_pitfall_has_a_task():
 
 
 HEALTHY = dict(kl=0.01, entropy=0.6, std=0.5, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
-HEALTHY |= dict(n_episodes=16, n_steps=256, used_fraction=1.0)
+HEALTHY |= dict(largest_entropy=0.69, n_episodes=16, n_steps=256, used_fraction=1.0)
 
 
 def seen(*updates, n=1, progress=1.0, signal=0.0, **kwargs):

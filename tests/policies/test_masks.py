@@ -350,6 +350,24 @@ def test_the_gradient_lab_measures_a_masked_policy():
     assert len(compare_estimators(model, 8, 3, n_delta=2, n_resamples=2)) > 0
 
 
+class Forced(Masked):
+    """Allows one action only, but for every tenth step."""
+
+    def observe(self):
+        obs = super().observe()
+        self.parts[0][:] = self.n_steps % 10 == 0
+        self.parts[0][0] = True
+        return obs
+
+
+@pytest.mark.filterwarnings("ignore:The returns")
+def test_a_policy_that_has_no_choice_is_not_called_deterministic():
+    env = make_vec_env(lambda: ActionMaskObservation(Forced(*TASKS["discrete"], lengths=(50,))), 2, seed=0)
+    callback = PitfallCallback()
+    make("reinforce", env, learning_rate=1e-4).learn(1000, callback)
+    assert "deterministic_too_early" not in callback.found
+
+
 @pytest.mark.parametrize("algorithm", [*ALGORITHMS])
 @pytest.mark.parametrize("space", [spaces.MultiBinary(3), spaces.Box(-1, 1, (2,))])
 def test_only_discrete_actions_can_be_masked(space, algorithm):
