@@ -4,10 +4,11 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -21,6 +22,14 @@ from sb3_reinforce.sampling.collection import Bools, TerminalObs
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
 __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
+
+
+# What sb3-contrib's policies compute for one step, and what computes it for whole sequences
+SEQUENCE_METHODS = {
+    "get_distribution": "sequence_distribution",
+    "predict_values": "sequence_values",
+    "_process_sequence": "remember",
+}
 
 
 class RecurrentREINFORCE(REINFORCE):
@@ -43,6 +52,7 @@ class RecurrentREINFORCE(REINFORCE):
 
     :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy, MaskedLstmPolicy or a subclass of one of them
     :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: Of the policy, and of the critic unless ``critic_learning_rate`` is given; a schedule too
     :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
     :param n_episodes: Whole episodes per rollout; 16 if ``n_steps`` is None too
     :param batch_size: Steps per minibatch of the critic, at least one whole sequence
@@ -62,6 +72,7 @@ class RecurrentREINFORCE(REINFORCE):
         self,
         policy: str | type[RecurrentPolicy],
         env: GymEnv | str,
+        learning_rate: float | Schedule = 2e-3,
         *,
         n_steps: int | None = None,
         n_episodes: int | None = None,
@@ -72,20 +83,40 @@ class RecurrentREINFORCE(REINFORCE):
             n_episodes = 16
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
-        super().__init__(policy, env, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs)
+        super().__init__(
+            policy, env, learning_rate, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs
+        )
 
     def _check_policy(self, policy: str | type) -> None:
         if isinstance(policy, str):
             super()._check_policy(policy)
-        elif not issubclass(policy, RecurrentPolicy):
+            return
+        if not issubclass(policy, tuple(self.policy_aliases.values())):
             raise ValueError(
                 f"policy must be one of {', '.join(self.policy_aliases)} of sb3_reinforce.recurrent or a subclass, got "
                 f"{policy.__name__}"
             )
+        own = {name for cls in policy.__mro__[: policy.__mro__.index(RecurrentPolicy)] for name in vars(cls)}
+        for step, sequence in SEQUENCE_METHODS.items():
+            if step in own and sequence not in own:
+                raise ValueError(
+                    f"policy={policy.__name__} overrides {step}, which is called for single steps: override {sequence} "
+                    "too, which is called for whole sequences in training"
+                )
+
+    def _setup_model(self) -> None:
+        has_dicts = isinstance(self.observation_space, spaces.Dict)
+        if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy):
+            fitting = MultiInputLstmPolicy if has_dicts else MlpLstmPolicy
+            if self.policy_class is not fitting:
+                raise ValueError(
+                    f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
+                    f"{self.policy_class.__name__}"
+                )
+        super()._setup_model()
 
     def _excluded_save_params(self) -> list[str]:
-        # The environments are reset after loading
-        return [*super()._excluded_save_params(), "_actor", "_state", "_next_state"]
+        return [*super()._excluded_save_params(), "_actor"]
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
@@ -111,13 +142,17 @@ class RecurrentREINFORCE(REINFORCE):
             # A callback has changed the policy during the rollout
             state = self._actor.state()
         else:
-            starts = th.as_tensor(self._last_episode_starts, device=self.device)
+            starts = th.as_tensor(self._episode_starts(), device=self.device)
             self._state = None
             if self._next_state is not None and not starts.all():
                 self._state = self._next_state * ~starts[(...,) + (None,) * 4]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
-        self._actor = make_recurrent_actor(policy, state, lambda: cast(Bools, self._last_episode_starts), keep_outputs)
+        self._actor = make_recurrent_actor(policy, state, self._episode_starts, keep_outputs)
         return self._actor
+
+    def _episode_starts(self) -> Bools:
+        """Where episodes start with the observation at hand; some VecEnvs give numbers."""
+        return np.asarray(self._last_episode_starts, dtype=bool)
 
     def _state_after_rollout(self) -> th.Tensor:
         """The states at the cut; the critic's is computed from the rollout, since only the actor acts."""

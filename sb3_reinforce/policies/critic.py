@@ -112,11 +112,15 @@ def value_of_batch(
 
     The features are computed once if the passes do not change the features extractor: they are the same in every pass.
     """
-    if isinstance(policy, RecurrentPolicy):
-        return lambda batch: policy.sequence_values(take(obs, batch))
     layers = route.critic
     extractor = policy.vf_features_extractor
     trained = {id(parameter) for parameter in parameters}
+    if isinstance(policy, RecurrentPolicy):
+        rows: Any = obs
+        if not extractor.training and trained.isdisjoint(map(id, extractor.parameters())):
+            with th.no_grad():
+                rows = {**rows, "features": policy.row_features(rows, extractor)}
+        return lambda batch: policy.sequence_values(take(rows, batch))
     if layers is None and (has_own_forward(policy) or overrides(policy, "evaluate_actions")):
         # V of such a policy may only be found along with log π
         return lambda batch: policy.evaluate_actions(take(obs, batch), actions[batch])[0]

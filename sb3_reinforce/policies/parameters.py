@@ -12,6 +12,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
+from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -22,6 +23,8 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     actions = as_policy_actions(zeros, policy.action_space)
     log_std = getattr(policy, "log_std", None)
     trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
+    if isinstance(policy, RecurrentPolicy):
+        raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
     training = policy.training
     policy.set_training_mode(False)
     try:

@@ -7,11 +7,18 @@ They take the arguments of sb3-contrib's classes of the same names, and ``memory
 from typing import Any
 
 import torch as th
-from sb3_contrib.common.recurrent.policies import (
-    RecurrentActorCriticCnnPolicy,
-    RecurrentActorCriticPolicy,
-    RecurrentMultiInputActorCriticPolicy,
-)
+
+try:
+    from sb3_contrib.common.recurrent.policies import (
+        RecurrentActorCriticCnnPolicy,
+        RecurrentActorCriticPolicy,
+        RecurrentMultiInputActorCriticPolicy,
+    )
+except ImportError as error:
+    raise ImportError(
+        f"sb3_reinforce.recurrent needs sb3-contrib ({error}): pip install 'sb3-reinforce[recurrent]', or "
+        "pip install -e '.[recurrent]' in a clone of the repository"
+    ) from error
 
 from sb3_reinforce.policies.masks import MaskedPolicy, sizes_of, split_mask
 from sb3_reinforce.policies.sequences import RecurrentPolicy, Rows

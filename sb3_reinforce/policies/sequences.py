@@ -18,33 +18,35 @@ from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence
 from torch.utils.checkpoint import checkpoint
 
+from sb3_reinforce.common.arguments import check_integer
+
 # "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
 # hidden and cell state, unless all sequences start from zero
 Rows: TypeAlias = dict[str, Any]
 State: TypeAlias = tuple[th.Tensor, th.Tensor]
 
 
-class GRU(nn.GRU):
-    """A GRU (Cho et al., 2014) with the interface of an LSTM: both halves of its state are the hidden state."""
+class AsLstm(nn.RNNBase):
+    """The interface of an LSTM for a network without a cell state: both halves of its state are the hidden state."""
 
-    def forward(self, x: th.Tensor, state: State | None = None) -> tuple[th.Tensor, State]:  # type: ignore[override]
+    def forward(self, x: Any, state: State | None = None) -> tuple[Any, State]:
         outputs, hidden = super().forward(x, None if state is None else state[0])
         return outputs, (hidden, hidden)
 
 
-class RNN(nn.RNN):
-    """An Elman network (1990) with the interface of an LSTM: both halves of its state are the hidden state."""
+class GRU(AsLstm, nn.GRU):  # type: ignore[misc]
+    """A GRU (Cho et al., 2014)."""
 
-    def forward(self, x: th.Tensor, state: State | None = None) -> tuple[th.Tensor, State]:  # type: ignore[override]
-        outputs, hidden = super().forward(x, None if state is None else state[0])
-        return outputs, (hidden, hidden)
+
+class RNN(AsLstm, nn.RNN):  # type: ignore[misc]
+    """An Elman network (1990)."""
 
 
 MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
 # Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
 FLOATS = 2**24
 GATES = 8
-LSTM_ARGUMENTS = ("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_kwargs")
+LSTM_ARGUMENTS = ("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm")
 
 
 class RecurrentPolicy(ActorCriticPolicy):
@@ -59,28 +61,32 @@ class RecurrentPolicy(ActorCriticPolicy):
     critic: Any
     lstm_hidden_state_shape: tuple[int, int, int]
 
-    def __init__(self, *args: Any, memory: str = "lstm", **kwargs: Any):
-        if memory not in MEMORIES:
-            raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory!r}")
-        if kwargs.get("shared_lstm") and kwargs.get("enable_critic_lstm", True):
-            raise ValueError("shared_lstm=True needs enable_critic_lstm=False: its critic reads the actor's memory")
+    def __init__(self, *args: Any, memory: str = "lstm", lstm_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        check_memory(memory, lstm_kwargs, **kwargs)
         super().__init__(*args, **kwargs)
-        self.memory = memory
         self.memory_arguments = {name: kwargs[name] for name in LSTM_ARGUMENTS if name in kwargs}
+        self.memory_arguments |= {"memory": memory, "lstm_kwargs": lstm_kwargs}
+        # In the place of sb3-contrib's, which are LSTMs without arguments here
         n_layers, _, n_hidden = self.lstm_hidden_state_shape
         for name in ("lstm_actor", "lstm_critic"):
             if getattr(self, name) is not None:
-                options = kwargs.get("lstm_kwargs") or {}
-                recurrence = MEMORIES[memory](self.features_dim, n_hidden, num_layers=n_layers, **options)
-                if self.ortho_init:
-                    initialize(recurrence)
-                setattr(self, name, recurrence)
+                make = MEMORIES[memory]
+                setattr(self, name, make(self.features_dim, n_hidden, num_layers=n_layers, **(lstm_kwargs or {})))
+        if self.ortho_init:
+            for part in filter(None, (self.lstm_actor, self.lstm_critic, self.critic)):
+                initialize(part, n_hidden)
         rate = self.optimizer.param_groups[0]["lr"]
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         # sb3-contrib leaves them out, and a policy that is loaded would have other shapes
-        return super()._get_constructor_parameters() | self.memory_arguments | {"memory": self.memory}
+        return super()._get_constructor_parameters() | self.memory_arguments
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Set the mode of all parts but of memories without dropout: cuDNN has no backward pass in evaluation mode."""
+        super().set_training_mode(mode)
+        for memory in filter(None, (self.lstm_actor, self.lstm_critic)):
+            memory.train(mode or not memory.dropout)
 
     def predict(
         self,
@@ -89,17 +95,20 @@ class RecurrentPolicy(ActorCriticPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions and the next state; the state is checked first."""
-        if state is not None:
-            obs, _ = self.obs_to_tensor(observation)
-            n_layers, _, n_hidden = self.lstm_hidden_state_shape
-            n_envs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
-            shapes = [np.shape(part) for part in state]
-            if shapes != [(n_layers, n_envs, n_hidden)] * 2:
-                raise ValueError(
-                    f"state must be the one that predict returned for these {n_envs} environments, two arrays of shape "
-                    f"{(n_layers, n_envs, n_hidden)}, or None where episodes start; got arrays of shapes {shapes}"
-                )
+        """Return the actions and the next state; the arguments are checked first."""
+        if isinstance(observation, tuple):
+            raise ValueError("observation must not be a tuple: Gymnasium's reset returns the observation and an info")
+        obs, _ = self.obs_to_tensor(observation)
+        n_layers, _, n_hidden = self.lstm_hidden_state_shape
+        n_envs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
+        shapes = [np.shape(part) for part in state] if isinstance(state, tuple) else repr(state)
+        if state is not None and shapes != [(n_layers, n_envs, n_hidden)] * 2:
+            raise ValueError(
+                f"state must be the one that predict returned for these {n_envs} environments, a tuple of two arrays "
+                f"of shape {(n_layers, n_envs, n_hidden)}, or None where episodes start; got {shapes}"
+            )
+        if episode_start is not None and np.shape(episode_start) != (n_envs,):
+            raise ValueError(f"episode_start must have shape ({n_envs},), got {np.shape(episode_start)}")
         return super().predict(observation, state, episode_start, deterministic)
 
     def zero_state(self, n_envs: int) -> th.Tensor:
@@ -129,24 +138,36 @@ class RecurrentPolicy(ActorCriticPolicy):
         return self.remember(self.lstm_actor, self.row_features(rows, self.pi_features_extractor), rows, critic=False)
 
     def row_features(self, rows: Rows, extractor: nn.Module) -> th.Tensor:
-        """The features of n rows, without padding."""
+        """The features of n rows, without padding, unless the rows have them already."""
+        if "features" in rows:
+            return cast(th.Tensor, rows["features"])
         return BasePolicy.extract_features(self, rows["observations"], extractor)  # type: ignore[arg-type]
 
     def remember(self, recurrence: nn.RNNBase, features: th.Tensor, rows: Rows, critic: bool) -> th.Tensor:
         """The outputs of a recurrent network for n rows of sequences, shape ``(n, n_hidden)``."""
         index, is_row = padded_index(rows["sequence"])
+        longest_first = is_row.sum(0).argsort(descending=True)
+        index = index[:, longest_first]
+        is_row = is_row[:, longest_first]
         state = initial_state(rows, index[0], critic)
         n_at_once = max(1, FLOATS // (GATES * index.shape[1] * recurrence.hidden_size))
-        if len(index) <= n_at_once:
-            outputs, _ = recurrence(features[index], state)
-        else:
-            # The gates of long episodes are computed again for the backward pass: its gradient is exact, in less memory
-            parts = []
-            for part in th.split(index, n_at_once):
+        outputs = []
+        places = []
+        for part, is_part in zip(th.split(index, n_at_once), th.split(is_row, n_at_once), strict=True):
+            n_running = int(is_part[0].sum())
+            part = part[:, :n_running]
+            is_part = is_part[:, :n_running]
+            if state is not None:
+                state = (state[0][:, :n_running].contiguous(), state[1][:, :n_running].contiguous())
+            if len(index) <= n_at_once:
+                output, state = recurrence(features[part], state)
+            else:
+                # The gates of long episodes are computed again for the backward pass: exact, in less memory
                 output, state = checkpoint(recurrence, features[part], state, use_reentrant=False)
-                parts.append(output)
-            outputs = th.cat(parts)
-        return th.empty_like(outputs[is_row]).index_copy(0, index[is_row], outputs[is_row])
+            outputs.append(output[is_part])
+            places.append(part[is_part])
+        remembered = th.cat(outputs)
+        return th.empty_like(remembered).index_copy(0, th.cat(places), remembered)
 
     @th.no_grad()
     def state_after(self, rows: Rows) -> th.Tensor:
@@ -159,11 +180,26 @@ class RecurrentPolicy(ActorCriticPolicy):
         return th.stack(state).permute(2, 0, 1, 3)
 
 
-def initialize(recurrence: nn.RNNBase) -> None:
+def check_memory(memory: Any, lstm_kwargs: Any, **kwargs: Any) -> None:
+    """Check the arguments of a recurrent policy that Stable-Baselines3 does not know."""
+    if memory not in MEMORIES:
+        raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory!r}")
+    for name in ("lstm_hidden_size", "n_lstm_layers"):
+        check_integer(name, kwargs.get(name, 1), 1)
+    allowed = {"bias", "dropout"} | ({"nonlinearity"} if memory == "rnn" else set())
+    if lstm_kwargs is not None and not (isinstance(lstm_kwargs, dict) and lstm_kwargs.keys() <= allowed):
+        raise ValueError(f"lstm_kwargs must be a dict with some of {', '.join(sorted(allowed))}, got {lstm_kwargs!r}")
+    if kwargs.get("shared_lstm") and kwargs.get("enable_critic_lstm", True):
+        raise ValueError("shared_lstm=True needs enable_critic_lstm=False: its critic reads the actor's memory")
+    if kwargs.get("shared_lstm") and not kwargs.get("share_features_extractor", True):
+        raise ValueError("shared_lstm=True needs share_features_extractor=True: its critic reads the actor's memory")
+
+
+def initialize(part: nn.Module, n_hidden: int) -> None:
     """Orthogonal weights for each gate, as Stable-Baselines3's other layers have, and zero biases."""
-    for name, parameter in recurrence.named_parameters():
-        if name.startswith("weight"):
-            for gate in th.split(parameter.data, recurrence.hidden_size):
+    for name, parameter in part.named_parameters():
+        if "weight" in name:
+            for gate in th.split(parameter.data, n_hidden):
                 nn.init.orthogonal_(gate)
         else:
             nn.init.zeros_(parameter)

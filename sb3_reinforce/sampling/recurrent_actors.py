@@ -10,7 +10,15 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_reinforce.policies.evaluation import route_of
-from sb3_reinforce.policies.plain_mlp import HOOKS, has_numpy_form, is_unchanged, plain_actor, takes_vectors
+from sb3_reinforce.policies.plain_mlp import (
+    HOOKS,
+    ONE_THREAD,
+    Floats,
+    has_numpy_form,
+    is_unchanged,
+    plain_actor,
+    takes_vectors,
+)
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
 
@@ -86,7 +94,9 @@ class LstmCell:
 
     def __init__(self, lstm: Any, state: th.Tensor):
         self.hidden, self.cell = (half.numpy().copy() for half in state[:, :, 0].unbind(1))
-        self.weights = [parameter.detach().numpy() for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
+        self.weights = [parameter.detach().T for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
+        is_small = len(state) * max(weight.numel() for weight in self.weights) <= ONE_THREAD
+        self.multiply = by_numpy if is_small else by_torch
         self.biases = [parameter.detach().numpy() for parameter in (lstm.bias_ih_l0, lstm.bias_hh_l0)]
         n_hidden = lstm.hidden_size
         # σ(x) = ½ tanh(½ x) + ½ for three gates, and tanh itself for g
@@ -105,11 +115,23 @@ class LstmCell:
             self.hidden[starts] = 0
             self.cell[starts] = 0
         x = obs.reshape(len(starts), -1).astype(np.float32, copy=False)
-        gates = x @ self.weights[0].T + self.hidden @ self.weights[1].T + self.biases[0] + self.biases[1]
+        gates = self.multiply(x, self.weights[0]) + self.multiply(self.hidden, self.weights[1])
+        gates += self.biases[0]
+        gates += self.biases[1]
         i, f, g, o = np.split(np.tanh(gates * self.scale) * self.scale + self.shift, 4, axis=1)
         self.cell = f * self.cell + i * g
         self.hidden = o * np.tanh(self.cell)
         return self.hidden
+
+
+def by_numpy(x: Floats, weight: th.Tensor) -> Any:
+    """``x W``."""
+    return np.dot(x, weight.numpy())
+
+
+def by_torch(x: Floats, weight: th.Tensor) -> Any:
+    """``x W``, with as many threads as the user has set for PyTorch."""
+    return th.mm(th.from_numpy(x), weight).numpy()
 
 
 RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor
@@ -131,6 +153,6 @@ def make_head(policy: Any) -> list[nn.Module] | None:
     lstm = policy.lstm_actor
     if layers is None or not has_numpy_form(layers) or not takes_vectors(policy, policy.pi_features_extractor):
         return None
-    is_plain = type(lstm) is nn.LSTM and is_unchanged(lstm) and lstm.num_layers == 1 and lstm.proj_size == 0
-    is_plain = is_plain and lstm.bias and not lstm.bidirectional and lstm.weight_ih_l0.dtype is th.float32
-    return layers if is_plain else None
+    if type(lstm) is not nn.LSTM or not is_unchanged(lstm) or lstm.num_layers > 1 or not lstm.bias:
+        return None
+    return layers

@@ -16,14 +16,16 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.tensors import stack, take
-from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines, landscape
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
-from sb3_reinforce.recurrent import RecurrentREINFORCE
+from sb3_reinforce.recurrent import MlpLstmPolicy, RecurrentREINFORCE
 
 GAMMA = 0.5
 # float32 holds them exactly
@@ -220,26 +222,85 @@ def test_the_lab_takes_it(network):
     assert RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
 
 
+class OneStep(MlpLstmPolicy):
+    """Overrides what is called for single steps alone."""
+
+    def get_distribution(self, obs, lstm_states, episode_starts):
+        return super().get_distribution(obs, lstm_states, episode_starts)
+
+
+class Numbers(VecEnvWrapper):
+    """Gives the dones as numbers, as some VecEnvs do."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return obs, rewards, dones.astype(np.float32), infos
+
+
+@pytest.mark.parametrize("n_steps", [7, None])
+def test_dones_may_be_numbers(n_steps):
+    ends = []
+    for wrap in (Numbers, lambda env: env):
+        env = make_vec_env(lambda: Corridor((3, 5), lambda t, action: float(action)), 2, seed=0)
+        model = make_recurrent(env=wrap(env), double=False, n_steps=n_steps).learn(60)
+        ends.append(plain(model.policy.state_dict()))
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+def test_a_memory_without_dropout_stays_in_training_mode(dropout):
+    """Where cuDNN has a backward pass; with dropout the mode matters."""
+    network = {"n_lstm_layers": 2, "lstm_kwargs": {"dropout": dropout}}
+    policy = make_recurrent(env="CartPole-v1", double=False, policy_kwargs=network).policy
+    policy.set_training_mode(False)
+    assert policy.lstm_actor.training == policy.lstm_critic.training == (dropout == 0)
+    assert not policy.mlp_extractor.training
+
+
+def memory(**policy_kwargs):
+    return lambda env: make_recurrent(env=env, policy_kwargs=policy_kwargs)
+
+
+def predict(*arguments):
+    return lambda env: make_recurrent(env=env, double=False).predict(*arguments)
+
+
+THREE = np.zeros((3, 4), dtype=np.float32)
+TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
+
+
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
         (lambda env: REINFORCE("MlpLstmPolicy", env), "RecurrentREINFORCE"),
         (lambda env: RecurrentREINFORCE("MlpPolicy", env), "policy must be a class or one of .*MlpLstmPolicy"),
+        (lambda env: RecurrentREINFORCE(RecurrentActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
+        (lambda env: RecurrentREINFORCE(ActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
+        (lambda env: RecurrentREINFORCE(OneStep, env), "override sequence_distribution too"),
         (
-            lambda env: RecurrentREINFORCE(RecurrentActorCriticPolicy, env),
-            "policy",
+            lambda env: RecurrentREINFORCE("MultiInputLstmPolicy", env),
+            "policy must be MlpLstmPolicy for observations in",
         ),
-        (lambda env: RecurrentREINFORCE(REINFORCE("MlpPolicy", env).policy_class, env), "policy must be one of"),
-        (lambda env: make_recurrent(env=env, policy_kwargs={"memory": "LSTM"}), "memory must be one of lstm, gru, rnn"),
-        (lambda env: make_recurrent(env=env, policy_kwargs={"shared_lstm": True}), "shared_lstm=True needs"),
+        (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
+        (memory(memory="LSTM"), "memory must be one of lstm, gru, rnn"),
+        (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
+        (
+            memory(shared_lstm=True, enable_critic_lstm=False, share_features_extractor=False),
+            "share_features_extractor",
+        ),
+        (memory(lstm_hidden_size=0), "lstm_hidden_size must be"),
+        (memory(n_lstm_layers=0), "n_lstm_layers must be"),
+        (memory(lstm_kwargs={"batch_first": True}), "lstm_kwargs must be a dict with some of bias, dropout"),
+        (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
+        (predict(THREE, TWO_STATES), r"state must be .* of shape \(1, 3, 4\)"),
+        (predict(THREE, 3), "state must be .*; got 3"),
+        (predict(THREE, None, np.ones(2, dtype=bool)), r"episode_start must have shape \(3,\), got \(2,\)"),
+        (predict((THREE, {})), "observation must not be a tuple"),
     ],
 )
-def test_what_is_no_recurrent_policy(call, sentence):
+def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
     with pytest.raises(ValueError, match=sentence):
         call(make_vec_env("CartPole-v1"))
-
-
-def test_a_state_of_other_environments():
-    model = make_recurrent(env=make_vec_env("CartPole-v1"), double=False)
-    with pytest.raises(ValueError, match=r"state must be .* two arrays of shape \(1, 3, 4\)"):
-        model.predict(np.zeros((3, 4)), (np.zeros((1, 2, 4)), np.zeros((1, 2, 4))))
