@@ -76,9 +76,9 @@ class NumpyActor:
         self.addresses = addresses_of(policy, layers)
         self.distribution = policy.action_dist
         self.mlp_extractor = policy.mlp_extractor
-        self.extractor = policy.pi_features_extractor
+        self.extractor = [policy.pi_features_extractor, *policy.pi_features_extractor.children()]
         body = policy.mlp_extractor.policy_net
-        parts = [policy, self.mlp_extractor, body, self.extractor, *self.extractor.children(), *layers]
+        parts = [policy, self.mlp_extractor, body, *self.extractor, *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
         self.dicts = [vars(self.distribution), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
@@ -101,7 +101,7 @@ class NumpyActor:
             policy is self.policy
             and sum(map(len, self.dicts)) == self.n_entries
             and policy.action_dist is self.distribution
-            and policy.pi_features_extractor is self.extractor
+            and [policy.pi_features_extractor, *policy.pi_features_extractor.children()] == self.extractor
             and policy.mlp_extractor is self.mlp_extractor
             and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers
             and addresses_of(policy, self.layers) == self.addresses

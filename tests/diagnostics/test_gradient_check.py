@@ -232,3 +232,9 @@ def test_returns_by_definition_are_the_recursive_ones():
 def test_a_policy_that_cannot_be_differentiated_is_named():
     with pytest.raises(ValueError, match="Altered cannot be differentiated"):
         check_gradient(REINFORCE(DETACHED, Tree(), device="cpu", baseline="none"))
+
+
+def test_the_table_says_what_its_columns_are():
+    table = check_gradient(REINFORCE("MlpPolicy", corridor(ACTION_SPACES[0]), device="cpu"), 2)
+    below = str(table).splitlines()[len(table) + 2 :]
+    assert all(column in "\n".join(below) for column in table.columns[1:])

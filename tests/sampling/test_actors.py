@@ -214,7 +214,23 @@ def new_distribution(model):
     model.policy.action_dist = Preferring(2)
 
 
+class Negative(th.nn.Flatten):
+    """Negative features, where the observations are positive."""
+
+    def forward(self, x):
+        return super().forward(x) * 0 - 1e3
+
+
+def new_part_of_the_extractor(model):
+    with th.no_grad():
+        for layer in (model.policy.mlp_extractor.policy_net[0], model.policy.mlp_extractor.policy_net[2]):
+            layer.weight.abs_()
+        model.policy.action_net.weight.abs_().mul_(th.tensor([[1e3], [-1e3]]))
+    model.policy.features_extractor.flatten = Negative()
+
+
 HOWS = {
+    "extractor": new_part_of_the_extractor,
     "distribution": new_distribution,
     "values": prefer,
     "policy": new_policy,
