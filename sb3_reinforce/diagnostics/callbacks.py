@@ -13,22 +13,14 @@ from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
-from sb3_reinforce.diagnostics.pitfalls import (
-    CAUSES,
-    PITFALLS,
-    History,
-    Update,
-    largest_entropy,
-    std_of,
-    temperature_of,
-)
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, largest_entropy, std_of
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature, temperature_of
 from sb3_reinforce.reinforce import REINFORCE
 
 

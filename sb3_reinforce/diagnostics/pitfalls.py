@@ -17,7 +17,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
 from sb3_reinforce.policies.evaluation import action_distribution
-from sb3_reinforce.policies.plain_mlp import temperature_hooks
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -193,13 +192,6 @@ def largest_entropy(policy: ActorCriticPolicy, obs: Any) -> float:
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
         return float(sum(part.logits.isfinite().sum(-1).log().mean() for part in parts))
     return math.log(2) * math.prod(policy.action_space.shape or ())
-
-
-def temperature_of(policy: ActorCriticPolicy) -> float:
-    """The temperature at which a policy acts."""
-    layer = getattr(policy, "action_net", None)
-    hooks = temperature_hooks(layer) if layer is not None else []
-    return float(hooks[0].temperature) if hooks else 1.0
 
 
 def cut_episodes(history: History) -> str | None:

@@ -171,6 +171,13 @@ def depends_on(output: th.Tensor, parameters: Parameters) -> list[bool]:
     return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
 
 
+def temperature_of(policy: ActorCriticPolicy) -> float:
+    """The temperature at which a policy acts."""
+    layer = getattr(policy, "action_net", None)
+    hooks = temperature_hooks(layer) if layer is not None else []
+    return float(hooks[0].temperature) if hooks else 1.0
+
+
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     """
     Let the policy act and be evaluated at temperature τ, from 1e-3 on: a schedule may fall to 0.

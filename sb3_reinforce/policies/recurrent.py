@@ -1,8 +1,4 @@
-"""
-The recurrent policies of sb3-contrib, as RecurrentREINFORCE trains them.
-
-They take the arguments of sb3-contrib's classes of the same names, and ``memory``: "lstm", "gru" or "rnn".
-"""
+"""The recurrent policies of sb3-contrib, as RecurrentREINFORCE trains them."""
 
 from typing import Any
 
@@ -25,19 +21,35 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy, Rows
 
 
 class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
-    """A recurrent policy for observations that are vectors."""
+    """
+    A recurrent policy for observations that are vectors, with the arguments of sb3-contrib's class and one more.
+
+    The arguments below are given as ``policy_kwargs``. With ``ortho_init``, recurrent weights start orthogonal too.
+
+    :param memory: ``"lstm"``, ``"gru"`` (Cho et al., 2014) or ``"rnn"`` (an Elman network, 1990)
+    :param lstm_hidden_size: Hidden units of each layer
+    :param n_lstm_layers: Number of layers
+    :param enable_critic_lstm: Whether the critic has a memory apart
+    :param shared_lstm: Whether the critic reads the actor's memory, without training it
+    :param lstm_kwargs: ``bias``, ``dropout``, and ``nonlinearity`` of ``"rnn"``
+    """
 
 
 class CnnLstmPolicy(RecurrentPolicy, RecurrentActorCriticCnnPolicy):
-    """A recurrent policy for images."""
+    """A recurrent policy for images, with the arguments of :class:`MlpLstmPolicy`."""
 
 
 class MultiInputLstmPolicy(RecurrentPolicy, RecurrentMultiInputActorCriticPolicy):
-    """A recurrent policy for Dict observations."""
+    """A recurrent policy for Dict observations, with the arguments of :class:`MlpLstmPolicy`."""
 
 
 class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy):
-    """A recurrent policy that takes no action which the observation forbids: see :class:`MaskedPolicy`."""
+    """
+    A recurrent policy that takes no action which the observation forbids.
+
+    :param args: As for :class:`~sb3_reinforce.MaskedPolicy`
+    :param kwargs: As for :class:`~sb3_reinforce.MaskedPolicy` and :class:`MlpLstmPolicy`
+    """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)

@@ -18,31 +18,13 @@ from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence
 from torch.utils.checkpoint import checkpoint
 
-from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.policies.memories import MEMORIES, State, check_memory, initialize
 
 # "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
 # hidden and cell state, unless all sequences start from zero
 Rows: TypeAlias = dict[str, Any]
-State: TypeAlias = tuple[th.Tensor, th.Tensor]
 
 
-class AsLstm(nn.RNNBase):
-    """The interface of an LSTM for a network without a cell state: both halves of its state are the hidden state."""
-
-    def forward(self, x: Any, state: State | None = None) -> tuple[Any, State]:
-        outputs, hidden = super().forward(x, None if state is None else state[0])
-        return outputs, (hidden, hidden)
-
-
-class GRU(AsLstm, nn.GRU):  # type: ignore[misc]
-    """A GRU (Cho et al., 2014)."""
-
-
-class RNN(AsLstm, nn.RNN):  # type: ignore[misc]
-    """An Elman network (1990)."""
-
-
-MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
 # Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
 FLOATS = 2**24
 GATES = 8
@@ -178,31 +160,6 @@ class RecurrentPolicy(ActorCriticPolicy):
         packed = pack_padded_sequence(features[index], is_row.sum(0).cpu(), enforce_sorted=False)
         _, state = self.lstm_critic(packed, initial_state(rows, index[0], critic=True))
         return th.stack(state).permute(2, 0, 1, 3)
-
-
-def check_memory(memory: Any, lstm_kwargs: Any, **kwargs: Any) -> None:
-    """Check the arguments of a recurrent policy that Stable-Baselines3 does not know."""
-    if memory not in MEMORIES:
-        raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory!r}")
-    for name in ("lstm_hidden_size", "n_lstm_layers"):
-        check_integer(name, kwargs.get(name, 1), 1)
-    allowed = {"bias", "dropout"} | ({"nonlinearity"} if memory == "rnn" else set())
-    if lstm_kwargs is not None and not (isinstance(lstm_kwargs, dict) and lstm_kwargs.keys() <= allowed):
-        raise ValueError(f"lstm_kwargs must be a dict with some of {', '.join(sorted(allowed))}, got {lstm_kwargs!r}")
-    if kwargs.get("shared_lstm") and kwargs.get("enable_critic_lstm", True):
-        raise ValueError("shared_lstm=True needs enable_critic_lstm=False: its critic reads the actor's memory")
-    if kwargs.get("shared_lstm") and not kwargs.get("share_features_extractor", True):
-        raise ValueError("shared_lstm=True needs share_features_extractor=True: its critic reads the actor's memory")
-
-
-def initialize(part: nn.Module, n_hidden: int) -> None:
-    """Orthogonal weights for each gate, as Stable-Baselines3's other layers have, and zero biases."""
-    for name, parameter in part.named_parameters():
-        if "weight" in name:
-            for gate in th.split(parameter.data, n_hidden):
-                nn.init.orthogonal_(gate)
-        else:
-            nn.init.zeros_(parameter)
 
 
 def padded_index(sequence: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
