@@ -35,7 +35,7 @@ MAX_LEARNING_RATE = 1e6
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
-STACK_FRAMES = "use sb3_reinforce.recurrent.RecurrentREINFORCE, or stack observations with VecFrameStack"
+STACK_FRAMES = "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
 MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
 CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK}
@@ -58,7 +58,8 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
         return
     names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
     for name in names & CONTRIB_POLICIES.keys():
-        raise ValueError(f"policy must not be one of sb3-contrib, got {name}: {CONTRIB_POLICIES[name]}")
+        given = policy if isinstance(policy, str) else policy.__name__
+        raise ValueError(f"policy must be one that this algorithm trains, got {given}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 

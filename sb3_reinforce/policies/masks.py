@@ -19,7 +19,7 @@ from stable_baselines3.common.torch_layers import (
     MlpExtractor,
     NatureCNN,
 )
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 KEY = "action_mask"
@@ -50,7 +50,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any]):
         super().__init__(env)
         sizes = sizes_of(env.action_space)
-        if not env.has_wrapper_attr("action_masks"):
+        if not (env.has_wrapper_attr("action_masks") and callable(env.get_wrapper_attr("action_masks"))):
             raise TypeError(f"env must have a method action_masks() that says which actions are allowed, got {env}")
         space = env.observation_space
         self._has_dicts = isinstance(space, spaces.Dict)
@@ -75,14 +75,16 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
         """An observation with the mask of the present state."""
         masks = self.env.get_wrapper_attr("action_masks")()
         try:
-            mask = np.asarray(masks, dtype=bool).ravel()
+            numbers = np.ravel(masks)
         except ValueError:
             # Lists of different lengths
-            mask = np.empty(0, dtype=bool)
-        if len(mask) != self._n_actions:
+            numbers = np.empty(0)
+        # What is added to logits elsewhere would be read the other way round
+        if len(numbers) != self._n_actions or not np.isin(numbers, (0, 1)).all():
             raise ValueError(
                 f"action_masks() must return {self._n_actions} booleans in a row for {self.action_space}, got {masks!r}"
             )
+        mask = numbers.astype(bool)
         if not is_over and not np.logical_or.reduceat(mask, self._first_actions).all():
             each = " in each dimension" if isinstance(self.action_space, spaces.MultiDiscrete) else ""
             raise ValueError(
@@ -172,7 +174,7 @@ class MaskedPolicy(ActorCriticPolicy):
 
     π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
     log π, its gradient and the entropy are those of that distribution. Where nothing is allowed, as in terminal states,
-    all actions are. The critic and the features do not see the mask.
+    all actions are. The critic and the features do not see the mask. A2C and PPO need action spaces that start at 0.
 
     :param observation_space: A ``Dict`` with the key ``"action_mask"`` and at least one more
     :param action_space: ``Discrete`` or ``MultiDiscrete``
@@ -197,7 +199,8 @@ class MaskedPolicy(ActorCriticPolicy):
         if parts.get(KEY) != spaces.MultiBinary(n_actions) or len(parts) == 1:
             raise ValueError(
                 f"observation_space must be a Dict of observations and {KEY!r}: MultiBinary({n_actions}) with "
-                f"MaskedPolicy (wrap the environment in ActionMaskObservation), got {observation_space}"
+                f"MaskedPolicy (wrap the environment in ActionMaskObservation, or declare a mask of its own in this "
+                f"way), got {observation_space}"
             )
         if features_extractor_class is None:
             features_extractor_class = extractor_class_for(without_mask(parts))
@@ -210,11 +213,7 @@ class MaskedPolicy(ActorCriticPolicy):
         )
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """
-        Make a features extractor that leaves the mask alone.
-
-        :return: The features extractor
-        """
+        """Make a features extractor that leaves the mask alone."""
         space: Any = self.observation_space
         rest = without_mask(space.spaces)
         inner = self.features_extractor_class(
@@ -222,14 +221,21 @@ class MaskedPolicy(ActorCriticPolicy):
         )
         return MaskedExtractor(space, inner)
 
-    def _build_mlp_extractor(self) -> None:
-        super()._build_mlp_extractor()
-        n_actions = sum(sizes_of(self.action_space))
-        self.mlp_extractor = MaskedMlpExtractor(self.mlp_extractor, n_actions)  # type: ignore[assignment]
-
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        self.action_net = MaskedLogits(self.action_net, sizes_of(self.action_space))
+        # Not in _build_mlp_extractor, which users override
+        sizes = sizes_of(self.action_space)
+        self.mlp_extractor = MaskedMlpExtractor(self.mlp_extractor, sum(sizes))  # type: ignore[assignment]
+        self.action_net = MaskedLogits(self.action_net, sizes)
+
+    def obs_to_tensor(self, observation: Any) -> tuple[PyTorchObs, bool]:
+        """As for any policy, with an error for an observation without a mask."""
+        if not isinstance(observation, dict) or KEY not in observation:
+            raise ValueError(
+                f"observation must be a dict with the key {KEY!r}, got {observation!r}: wrap this environment in "
+                "ActionMaskObservation too"
+            )
+        return super().obs_to_tensor(observation)
 
 
 def extractor_class_for(space: spaces.Space[Any] | dict[str, spaces.Space[Any]]) -> type[BaseFeaturesExtractor]:

@@ -17,7 +17,13 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+    NatureCNN,
+)
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
@@ -383,8 +389,34 @@ def test_only_discrete_actions_can_be_masked(space, algorithm):
 def test_an_environment_needs_action_masks():
     with pytest.raises(TypeError, match=r"env must have a method action_masks\(\) .*got <Random"):
         ActionMaskObservation(Random(VECTOR))
+    attribute = Masked(VECTOR)
+    attribute.action_masks = np.ones(2, dtype=bool)
+    with pytest.raises(TypeError, match=r"env must have a method action_masks\(\)"):
+        ActionMaskObservation(attribute)
     with pytest.raises(ValueError, match="must not have the key 'action_mask' yet"):
         ActionMaskObservation(environment())
+
+
+@algorithms
+def test_an_evaluation_needs_masks_too(algorithm):
+    model = make(algorithm, environment())
+    for obs in (VECTOR.sample(), {"observation": VECTOR.sample()}):
+        with pytest.raises(ValueError, match=r"observation must be a dict with the key 'action_mask'.*wrap this"):
+            model.predict(obs)
+
+
+class OwnNetwork(MaskedPolicy):
+    """Has a network as Stable-Baselines3's documentation shows it."""
+
+    def _build_mlp_extractor(self):
+        self.mlp_extractor = MlpExtractor(self.features_dim, [3], th.nn.ReLU, self.device)
+
+
+def test_a_user_may_build_another_network():
+    env = make_vec_env(environment, 2, seed=0)
+    model = REINFORCE(OwnNetwork, env, n_steps=16, seed=0, device="cpu").learn(64)
+    assert type(model.policy.mlp_extractor.extractor) is MlpExtractor
+    evaluate_policy(model, env, n_eval_episodes=4, warn=False)
 
 
 @algorithms
@@ -411,6 +443,8 @@ def test_a_masked_policy_needs_masks_and_observations(space, algorithm):
         ("discrete", [True, False], "must return 5 booleans in a row for Discrete(5), got [True, False]"),
         ("discrete", None, "must return 5 booleans in a row for Discrete(5), got None"),
         ("discrete", np.zeros(6), "must return 5 booleans"),
+        ("discrete", [0.0, -np.inf, 0.0, 0.0, 0.0], "must return 5 booleans"),
+        ("discrete", [1, 2, 0, 0, 0], "must return 5 booleans"),
         ("discrete", [False] * 5, "must allow an action of Discrete(5) until the episode is over, got [False, "),
         ("multidiscrete", [[True] * 2, [True] * 4, [True] * 3], "must return 9 booleans in a row for MultiDiscrete"),
         ("multidiscrete", [True] * 6 + [False] * 3, "must allow an action in each dimension of MultiDiscrete"),
