@@ -44,7 +44,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     :param env: An environment with a method ``action_masks()`` that returns n booleans
     :raises TypeError: If the environment has no such method
     :raises ValueError: If actions are neither ``Discrete`` nor ``MultiDiscrete``, or observations already have a mask;
-        in ``reset`` and ``step``, if the mask does not have n entries, or allows nothing before the episode is over
+        in ``reset`` and ``step``, if the mask is not n zeros and ones, or allows nothing before the episode is over
     """
 
     def __init__(self, env: gym.Env[Any, Any]):
@@ -199,8 +199,8 @@ class MaskedPolicy(ActorCriticPolicy):
         if parts.get(KEY) != spaces.MultiBinary(n_actions) or len(parts) == 1:
             raise ValueError(
                 f"observation_space must be a Dict of observations and {KEY!r}: MultiBinary({n_actions}) with "
-                f"MaskedPolicy (wrap the environment in ActionMaskObservation, or declare a mask of its own in this "
-                f"way), got {observation_space}"
+                f"MaskedPolicy (wrap the environment in ActionMaskObservation, or declare its mask like this), got "
+                f"{observation_space}"
             )
         if features_extractor_class is None:
             features_extractor_class = extractor_class_for(without_mask(parts))

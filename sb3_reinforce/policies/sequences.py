@@ -3,8 +3,8 @@ Recurrent policies on whole sequences: one sequence is one episode, or its part 
 
 Such a policy is evaluated on rows: the observation, the number of the sequence that the row belongs to, and the state
 from which that sequence starts. Rows of one sequence stand in the order of time, so whatever selects whole sequences
-from a batch of rows selects a batch of rows. Sequences are padded and not packed, which takes half the time on a CPU;
-the padding follows the end of a sequence, where nothing depends on it.
+from a batch of rows selects a batch of rows. Sequences are padded and not packed, which is faster on a CPU; the padding
+follows the end of a sequence, where nothing depends on it.
 """
 
 from collections.abc import Iterator
@@ -23,8 +23,6 @@ from sb3_reinforce.policies.memories import MEMORIES, State, check_memory, initi
 # "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
 # hidden and cell state, unless all sequences start from zero
 Rows: TypeAlias = dict[str, Any]
-
-
 # Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
 FLOATS = 2**24
 GATES = 8
