@@ -142,6 +142,19 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[:2]
 
 
+@th.no_grad()
+def sampled_divergence(
+    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor
+) -> float:
+    """
+    The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
+
+    Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative.
+    """
+    log_ratio = evaluate(policy, route, obs, actions, with_values=False)[0] - log_prob
+    return float((log_ratio.exp() - 1 - log_ratio).mean())
+
+
 def split_parameters(
     policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
 ) -> tuple[Parameters, Parameters, Parameters]:
