@@ -76,6 +76,11 @@ class Running:
         """Every environment is at the start of an episode."""
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
+    def unless(self, starts: Bools) -> "Running":
+        """The episodes that go on where none ``starts``; those of further environments are left out."""
+        n_envs = len(starts)
+        return Running(np.where(starts, 0, self.timesteps[:n_envs]), np.where(starts, 0.0, self.rewards[:n_envs]))
+
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
         timesteps = timesteps_of(dones, self.timesteps)

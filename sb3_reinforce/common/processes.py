@@ -1,0 +1,180 @@
+"""
+Messages between the processes of a script that PyTorch's launcher has started.
+
+PyTorch introduces the processes to each other. Messages go through one connection between process 0 and each other
+process, since a call that waits in gloo answers no signal, has a timeout, and does not say which process has died.
+"""
+
+import os
+import pickle
+import secrets
+import socket
+import time
+from contextlib import suppress
+from datetime import timedelta
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Client, Listener, wait
+from typing import Any
+
+import torch.distributed as dist
+
+# With the value 0, each process learns alone
+SWITCH = "SB3_REINFORCE_PROCESSES"
+# Within these times the cause of a signal arrives, and torchrun's SIGTERM after another process has ended
+CAUSE_SECONDS = 0.5
+SIGTERM_SECONDS = 5.0
+
+
+class ProcessError(RuntimeError):
+    """Another process has stopped or died."""
+
+
+class Finished(Exception):
+    """Process 0 has finished learning; the argument is its last state."""
+
+
+def place() -> tuple[int, int]:
+    """The number of this process and W, the number of all, which learn together; (0, 1) if it learns alone."""
+    if os.environ.get(SWITCH) != "0" and dist.is_available():
+        if dist.is_initialized():
+            return dist.get_rank(), dist.get_world_size()
+        if dist.is_torchelastic_launched():
+            return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    return 0, 1
+
+
+def is_leader() -> bool:
+    """
+    Whether this process is the one that learns, logs and saves: process 0 of a script under torchrun, or the only one.
+
+    :return: False in the processes 1, 2, ... that ``python -m torch.distributed.run`` has started
+    """
+    return place()[0] == 0
+
+
+class Processes:
+    """The connections of process 0 with the others; ``with`` closes them, and tells the others of an error."""
+
+    def __init__(self) -> None:
+        if not dist.is_initialized():
+            # Process 0 may evaluate for hours before it calls learn() again
+            dist.init_process_group("gloo", timeout=timedelta(days=365))
+        self.rank, self.size = place()
+        self.lines: dict[Any, int] = {}
+        # What a process has collected since is reported
+        self.state: Any = None
+        self.in_round = False
+        self.connect()
+        self.waited = 0.0
+        self.started = time.perf_counter()
+
+    def __reduce__(self) -> Any:
+        # A model that is saved or copied while it learns is alone
+        return type(None), ()
+
+    def connect(self) -> None:
+        """Connect process 0 with each other process, which proves by a key that it belongs to the group."""
+        invitation: list[Any] = [None]
+        if self.rank == 0:
+            key = secrets.token_bytes(32)
+            listener = Listener(("", 0), backlog=self.size, authkey=key)
+            invitation = [(os.environ.get("MASTER_ADDR") or socket.gethostname(), listener.address[1], key)]
+        dist.broadcast_object_list(invitation, src=0)
+        host, port, key = invitation[0]
+        if self.rank > 0:
+            self.lines = {Client((host, port), authkey=key): 0}
+            self.send(self.rank)
+        else:
+            with listener:
+                while len(self.lines) < self.size - 1:
+                    # A stranger may have found the port
+                    with suppress(AuthenticationError, EOFError, OSError):
+                        line = listener.accept()
+                        self.lines[line] = pickle.loads(line.recv_bytes())
+        for line in self.lines:
+            # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
+            with socket.fromfd(line.fileno(), socket.AF_INET, socket.SOCK_STREAM) as own:
+                own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def send(self, data: Any) -> None:
+        """Send to all others, or to process 0; the next ``receive`` names a process that this does not reach."""
+        # Plainly, since a connection's own pickling would move PyTorch's tensors to shared memory
+        message = pickle.dumps(data)
+        for line in self.lines:
+            with suppress(OSError):
+                line.send_bytes(message)
+
+    def receive(self) -> list[Any]:
+        """The next data of each other process, in their order, or of process 0."""
+        received: dict[int, Any] = {}
+        start = time.perf_counter()
+        while len(received) < len(self.lines):
+            for line in wait([line for line, rank in self.lines.items() if rank not in received]):
+                received[self.lines[line]] = self.read(line)
+        self.waited += time.perf_counter() - start
+        return [received[rank] for rank in sorted(received)]
+
+    def read(self, line: Any) -> Any:
+        """The data that a process has sent; if it has sent an error, or has died, that is raised."""
+        try:
+            data = pickle.loads(line.recv_bytes())
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
+            message = f"Process {self.lines[line]} of {self.size} has died, or ended without a message"
+            raise ProcessError(message) from error
+        if isinstance(data, Exception):
+            raise data
+        return data
+
+    def exchange(self, data: Any) -> list[Any]:
+        """The data of all processes in every process, in their order."""
+        if self.rank == 0:
+            everything = [data, *self.receive()]
+            self.send(everything)
+        else:
+            self.send(data)
+            [everything] = self.receive()
+        return everything
+
+    def finish(self, state: Any) -> None:
+        """End the work of the others, after their part of a rollout that has been stopped."""
+        if self.in_round:
+            self.receive()
+        self.send(Finished(state))
+
+    def __enter__(self) -> "Processes":
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
+            if error is not None:
+                self.fail(error)
+        finally:
+            for line in self.lines:
+                line.close()
+
+    def fail(self, error: BaseException) -> None:
+        """Tell the others of an error, and raise the one of another process that has led to it."""
+        # torchrun sends SIGTERM where another process has ended
+        cause = self.cause_of(error) if isinstance(error, KeyboardInterrupt) else error
+        reason = f"{type(error).__name__}: {error}".removesuffix(": ")
+        own = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
+        self.send(cause if isinstance(cause, ProcessError) else own)
+        if isinstance(error, ProcessError) and dist.is_torchelastic_launched():
+            # Later the signal would interrupt the script while it saves the model
+            with suppress(KeyboardInterrupt):
+                time.sleep(SIGTERM_SECONDS)
+        if cause is not error:
+            raise cause from error
+
+    def cause_of(self, error: BaseException) -> BaseException:
+        """The end of another process that was not interrupted itself, or else the error."""
+        open_lines = {*self.lines}
+        while open_lines and (ready := wait(open_lines, CAUSE_SECONDS)):
+            for line in ready:
+                try:
+                    self.read(line)
+                except Exception as end:
+                    if isinstance(end, ProcessError) and KeyboardInterrupt.__name__ not in str(end):
+                        return end
+                    open_lines.discard(line)
+        return error
