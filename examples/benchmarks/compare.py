@@ -11,6 +11,9 @@ The CSV has a row per evaluation: on 10 deterministic episodes at the start of t
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
 ``cpu_seconds`` the same by the process's own clock, which a busy machine does not stretch. The rows of a run are
 written when it is finished, and a run that is there is not repeated: stop the script when you like and start it again.
+
+Under ``python -m torch.distributed.run --standalone --nproc-per-node W`` our runs collect in W processes, one run after
+the other, and process 0 makes those of the peers.
 """
 
 import argparse
@@ -38,6 +41,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_reinforce import is_leader
 from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
@@ -143,7 +147,8 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
         model, env, eval_env = make(run)
         evaluations = Evaluations(run, env, eval_env)
         model.learn(run.budget, evaluations, log_interval=None)
-        evaluations.evaluate("final", final_episodes)
+        if is_leader():
+            evaluations.evaluate("final", final_episodes)
     except Exception as error:
         return run, error
     return run, evaluations.rows
@@ -151,6 +156,8 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
 
 def finished(path: Path) -> set[tuple[Any, ...]]:
     """The runs that a CSV has the last row of."""
+    if not path.exists():
+        return set()
     rows = pd.read_csv(path)
     return set(rows.loc[rows["evaluation"] == "final", list(Run._fields)].itertuples(index=False, name=None))
 
@@ -170,7 +177,7 @@ def main() -> None:
     # As Ctrl-C, which ends the pool's processes too
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    if not arguments.output.exists():
+    if is_leader() and not arguments.output.exists():
         arguments.output.write_text(",".join(COLUMNS) + "\n")
     wanted = [
         Run(task, algorithm, seed, arguments.timesteps or BUDGETS.get(task, OTHER_BUDGET))
@@ -181,14 +188,22 @@ def main() -> None:
     if not runs:
         raise SystemExit(f"Nothing to do: {arguments.output} has the {len(wanted)} runs that there are settings for")
     failed, start = [], time.perf_counter()
-    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        results = pool.imap_unordered(functools.partial(train, arguments.final_episodes), runs)
+    with contextlib.ExitStack() as stack:
+        map_runs: Any = map
+        if not th.distributed.is_torchelastic_launched():
+            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes))
+            map_runs = pool.imap_unordered
+        elif not is_leader():
+            runs = [run for run in runs if run.algorithm in OURS]
+        results = map_runs(functools.partial(train, arguments.final_episodes), runs)
         for number, (run, outcome) in enumerate(results, 1):
             minutes = (time.perf_counter() - start) / 60
             left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"
             if isinstance(outcome, Exception):
                 result = repr(outcome)
                 failed.append(f"{run}: {result}")
+            elif not is_leader():
+                continue
             else:
                 pd.DataFrame(outcome).to_csv(arguments.output, mode="a", header=False, index=False)
                 result = "{return:.1f}, {steps} steps, {seconds:.0f} s".format(**outcome[-1])
