@@ -22,7 +22,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.base import BasePolicyGradient, together, uninterrupted
+from sb3_reinforce.common.base import BasePolicyGradient
+from sb3_reinforce.common.distribution import together
+from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
@@ -39,13 +41,7 @@ from sb3_reinforce.policies.evaluation import (
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.sampling.actors import Actor, make_actor
-from sb3_reinforce.sampling.collection import (
-    Extent,
-    by_step,
-    check_rollout_data,
-    collect,
-    warn_of_own_methods,
-)
+from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
@@ -278,6 +274,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
+        # The last rollout may have the columns of several processes
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         if self.use_sde:

@@ -1,6 +1,7 @@
 """Several processes that are one group of PyTorch's, as torchrun makes them, but forked, which takes no second."""
 
 import multiprocessing
+import os
 import pickle
 import warnings
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ def in_processes(size: int, function: Callable[[int], Any], folder: Path) -> lis
     place = f"file://{folder / 'group'}"
 
     def run(rank: int) -> None:
+        os.environ["MASTER_ADDR"] = "localhost"
         dist.init_process_group("gloo", init_method=place, rank=rank, world_size=size)
         try:
             answer = function(rank)

@@ -14,13 +14,10 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common import storage
 from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
-from sb3_reinforce.common.distribution import Distributed, together
-from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
-
-__all__ = ["BasePolicyGradient", "together", "uninterrupted"]
 
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
@@ -114,9 +111,8 @@ class BasePolicyGradient(Distributed):
     ) -> None:
         """
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
-        Of several processes under torchrun, process 0 alone writes the file.
 
-        :param path: The file, to which ``.zip`` is added where it has no suffix
+        :param path: The file, to which ``.zip`` is added where it has no suffix; under torchrun process 0 writes it
         :param exclude: Attributes not to save, besides those that never are
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written

@@ -20,8 +20,8 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 # The arguments that may differ between processes
 OWN_ARGUMENTS = {"verbose", "device", "tensorboard_log"}
-# The attributes of process 0 that all take over before they collect
-SHARED = (bool, int, float, str, th.Generator)
+# The attributes of process 0 that all take over before they collect; without an observation they reset environments
+SHARED = (bool, int, float, str, type(None), th.Generator)
 
 
 def together(learn: Learn) -> Learn:
@@ -63,18 +63,19 @@ class Distributed(BaseAlgorithm):
 
     def check_same(self) -> None:
         """Refuse processes that were started with different arguments."""
-        values = {name: getattr(self, ATTRIBUTES.get(name, name)) for name in self._arguments.keys() - OWN_ARGUMENTS}
-        own = {name: describe(value) for name, value in sorted(values.items())}
-        own["algorithm"] = type(self).__name__
-        own["n_envs"] = str(self.n_envs)
-        own["policy.state_dict"] = str({name: [*each.shape] for name, each in self.policy.state_dict().items()})
+        own = {"algorithm": type(self).__name__, "n_envs": str(self.n_envs)}
+        for name in sorted(self._arguments.keys() - OWN_ARGUMENTS):
+            value = getattr(self, ATTRIBUTES.get(name, name))
+            # Without the address of a function
+            own[name] = getattr(value, "__qualname__", repr(value) if isinstance(value, SHARED) else str(type(value)))
+        own["policy"] += f" with {[(name, *each.shape) for name, each in self.policy.state_dict().items()]}"
         first, *others = cast(Processes, self._processes).exchange(own)
         for rank, other in enumerate(others, 1):
-            for name in sorted({*first, *other}):
-                if first.get(name) != other.get(name):
+            for name in first:
+                if first[name] != other.get(name):
                     raise ValueError(
                         "All processes must be started with the same arguments: process 0 has "
-                        f"{name}={first.get(name)}, and process {rank} has {name}={other.get(name)}"
+                        f"{name}={first[name]}, and process {rank} has {name}={other.get(name)}"
                     )
 
     def shared_state(self) -> dict[str, Any]:
@@ -155,6 +156,10 @@ class Distributed(BaseAlgorithm):
                 self.adopt(*processes.receive())
         except Finished as end:
             self.adopt(*end.args)
+        except BaseException:
+            # Process 0 has dropped the rollout
+            self._last_obs = None
+            raise
 
     def collect_part(self, callback: BaseCallback) -> None:
         """Collect this process's part of a rollout."""
@@ -172,10 +177,3 @@ def seen_since(before: RunningMeanStd, after: RunningMeanStd) -> RunningMeanStd:
         seen.mean = before.mean + first
         seen.var = second - first**2
     return seen
-
-
-def describe(value: Any) -> str:
-    """A value as text that is the same in all processes."""
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return repr(value)
-    return str(getattr(value, "__qualname__", type(value).__qualname__))

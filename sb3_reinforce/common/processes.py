@@ -14,7 +14,7 @@ from contextlib import suppress
 from datetime import timedelta
 from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Listener, wait
-from typing import Any
+from typing import Any, cast
 
 import torch.distributed as dist
 
@@ -61,9 +61,9 @@ class Processes:
             dist.init_process_group("gloo", timeout=timedelta(days=365))
         self.rank, self.size = place()
         self.lines: dict[Any, int] = {}
-        # What a process has collected since is reported
-        self.state: Any = None
+        # Whether the others have yet to send their parts of a rollout, and the state that these started from
         self.in_round = False
+        self.state: Any = None
         self.connect()
         self.waited = 0.0
         self.started = time.perf_counter()
@@ -82,7 +82,7 @@ class Processes:
         dist.broadcast_object_list(invitation, src=0)
         host, port, key = invitation[0]
         if self.rank > 0:
-            self.lines = {Client((host, port), authkey=key): 0}
+            self.lines[Client((host, port), authkey=key)] = 0
             self.send(self.rank)
         else:
             with listener:
@@ -104,26 +104,24 @@ class Processes:
             with suppress(OSError):
                 line.send_bytes(message)
 
-    def receive(self) -> list[Any]:
-        """The next data of each other process, in their order, or of process 0."""
+    def receive(self, timeout: float | None = None) -> list[Any]:
+        """What each other process sends next, in their order, or process 0; an error that one sends is raised."""
         received: dict[int, Any] = {}
         start = time.perf_counter()
-        while len(received) < len(self.lines):
-            for line in wait([line for line, rank in self.lines.items() if rank not in received]):
-                received[self.lines[line]] = self.read(line)
+        missing = {*self.lines}
+        while missing and (ready := wait(missing, timeout)):
+            for line in cast(Any, ready):
+                try:
+                    data = pickle.loads(line.recv_bytes())
+                except (EOFError, OSError, pickle.UnpicklingError) as error:
+                    message = f"Process {self.lines[line]} of {self.size} has died, or ended without a message"
+                    raise ProcessError(message) from error
+                if isinstance(data, Exception):
+                    raise data
+                received[self.lines[line]] = data
+                missing.remove(line)
         self.waited += time.perf_counter() - start
         return [received[rank] for rank in sorted(received)]
-
-    def read(self, line: Any) -> Any:
-        """The data that a process has sent; if it has sent an error, or has died, that is raised."""
-        try:
-            data = pickle.loads(line.recv_bytes())
-        except (EOFError, OSError, pickle.UnpicklingError) as error:
-            message = f"Process {self.lines[line]} of {self.size} has died, or ended without a message"
-            raise ProcessError(message) from error
-        if isinstance(data, Exception):
-            raise data
-        return data
 
     def exchange(self, data: Any) -> list[Any]:
         """The data of all processes in every process, in their order."""
@@ -136,7 +134,7 @@ class Processes:
         return everything
 
     def finish(self, state: Any) -> None:
-        """End the work of the others, after their part of a rollout that has been stopped."""
+        """End the work of the others, after their parts of a rollout that a callback has stopped."""
         if self.in_round:
             self.receive()
         self.send(Finished(state))
@@ -153,28 +151,19 @@ class Processes:
                 line.close()
 
     def fail(self, error: BaseException) -> None:
-        """Tell the others of an error, and raise the one of another process that has led to it."""
-        # torchrun sends SIGTERM where another process has ended
-        cause = self.cause_of(error) if isinstance(error, KeyboardInterrupt) else error
+        """Tell the others of an error, or of the end of another process that has led to it, which is raised instead."""
         reason = f"{type(error).__name__}: {error}".removesuffix(": ")
-        own = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
-        self.send(cause if isinstance(cause, ProcessError) else own)
+        told = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
+        if isinstance(error, KeyboardInterrupt):
+            # torchrun sends SIGTERM where another process has ended; it may also have been interrupted as this one
+            try:
+                self.receive(CAUSE_SECONDS)
+            except Exception as cause:
+                if isinstance(cause, ProcessError) and KeyboardInterrupt.__name__ not in str(cause):
+                    self.send(cause)
+                    raise cause from error
+        self.send(error if isinstance(error, ProcessError) else told)
         if isinstance(error, ProcessError) and dist.is_torchelastic_launched():
-            # Later the signal would interrupt the script while it saves the model
+            # Later its SIGTERM would interrupt the script while it saves the model
             with suppress(KeyboardInterrupt):
                 time.sleep(SIGTERM_SECONDS)
-        if cause is not error:
-            raise cause from error
-
-    def cause_of(self, error: BaseException) -> BaseException:
-        """The end of another process that was not interrupted itself, or else the error."""
-        open_lines = {*self.lines}
-        while open_lines and (ready := wait(open_lines, CAUSE_SECONDS)):
-            for line in ready:
-                try:
-                    self.read(line)
-                except Exception as end:
-                    if isinstance(end, ProcessError) and KeyboardInterrupt.__name__ not in str(end):
-                        return end
-                    open_lines.discard(line)
-        return error

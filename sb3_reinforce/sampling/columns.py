@@ -40,7 +40,8 @@ def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | Non
 def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]], device: Any = "cpu") -> Columns:
     """Write the parts side by side into the buffer, as one process would with the environments of all."""
     all_columns = [columns for columns, _ in parts]
-    n_steps = max(len(columns.dones) for columns in all_columns)
+    # A process without a quota has waited for the end of an episode that does not count
+    n_steps = max(len(columns.dones) for columns in all_columns if columns.quota.any())
     for name in ROWS:
         setattr(buffer, name, side_by_side([rows[name] for _, rows in parts], n_steps))
     buffer.n_envs = buffer.rewards.shape[1]
@@ -53,6 +54,8 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         for (step, env), obs in columns.terminal_obs.items()
     ]
     states = [columns.state for columns in all_columns if columns.state is not None]
+    # A process whose environments all start episodes has none
+    state = [states[0] * 0 if columns.state is None else columns.state for columns in all_columns if states]
     return Columns(
         # An episode that ends behind the quota does not count, and the padding ends none
         dones=side_by_side([columns.dones for columns in all_columns], n_steps),
@@ -60,16 +63,15 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         terminal_obs=dict(sorted(terminal_obs, key=lambda item: item[0])),
         last_obs=take(side_by_side([take(columns.last_obs, None) for columns in all_columns], 1), 0),
         quota=np.concatenate([columns.quota for columns in all_columns]),
-        state=th.cat([states[0] * 0 if c.state is None else c.state for c in all_columns]).to(device)
-        if states
-        else None,
+        state=th.cat(state).to(device) if state else None,
     )
 
 
 def side_by_side(arrays: Sequence[Any], n_steps: int) -> Any:
-    """Arrays, or dicts of arrays, along the axis of the environments, after zeros were added up to ``n_steps`` rows."""
+    """Arrays, or dicts of arrays, along the axis of the environments, cut or filled with zeros to ``n_steps`` rows."""
     if isinstance(arrays[0], dict):
         return {key: side_by_side([part[key] for part in arrays], n_steps) for key in arrays[0]}
+    columns = [rows[:n_steps] for rows in arrays]
     return np.concatenate(
-        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)]) for rows in arrays], axis=1
+        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)]) for rows in columns], axis=1
     )

@@ -13,12 +13,13 @@ import pytest
 import torch as th
 from callbacks import At
 from environments import Corridor
-from models import KINDS, Scaled, all_kinds, make, plain
+from models import KINDS, Scaled, make, plain
 from processes import ActAsRecorded, RecordRollouts, Replay, in_processes, logged
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_reinforce import is_leader
+from sb3_reinforce.common.distribution import seen_since
 from sb3_reinforce.common.processes import ProcessError
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -32,83 +33,91 @@ SEARCHES = {
 }
 
 
-def search(n_envs, rank, **kwargs):
-    model = make("search", make_vec_env("CartPole-v1", n_envs), seed=5, **{"common_random_numbers": True, **kwargs})
-    model.learn(10**6, lambda values, _: model._n_updates < 5)
-    return plain(model.theta), model._n_updates, len(model.ep_info_buffer)
+def search(rank, n_envs, n_updates, names):
+    answers = {}
+    for name in names:
+        env = make_vec_env("CartPole-v1", n_envs)
+        model = make("search", env, seed=5, **{**SEARCHES[name], "common_random_numbers": True})
+        model.learn(10**6, lambda values, _, model=model: model._n_updates < n_updates)
+        answers[name] = plain(model.theta), model._n_updates, len(model.ep_info_buffer)
+    return answers
 
 
-@pytest.mark.parametrize("kwargs", SEARCHES.values(), ids=SEARCHES)
-def test_finite_difference_has_the_same_parameters_bit_for_bit(kwargs, tmp_path):
-    alone = search(4, 0, **kwargs)
-    for size in (2, 4):
-        answers = in_processes(size, partial(search, 4 // size, **kwargs), tmp_path)
-        assert [answer[:2] for answer in answers] == [alone[:2]] * size
-        assert answers[0][2] == alone[2]
+@pytest.mark.parametrize(
+    ("n_updates", "names", "sizes"),
+    [(5, SEARCHES, (2,)), pytest.param(50, ("central", "two utilities"), (2, 4), marks=pytest.mark.slow)],
+)
+def test_finite_difference_has_the_same_parameters_bit_for_bit(n_updates, names, sizes, tmp_path):
+    alone = search(0, 4, n_updates, names)
+    for size in sizes:
+        task = partial(search, n_envs=4 // size, n_updates=n_updates, names=names)
+        first, *others = in_processes(size, task, tmp_path)
+        assert first == alone
+        assert all(other[name][:2] == first[name][:2] for other in others for name in names)
 
 
-EXTENTS = {"steps": {"n_steps": 12}, "episodes": {"n_steps": None, "n_episodes": 5}}
-ROLLOUTS = {
-    f"{name} {extent}": ({"baseline": name, **kwargs}, lambda env: env)
-    for name in BASELINES
-    for extent, kwargs in EXTENTS.items()
-} | {
-    "shared extractor": ({"policy_kwargs": {"net_arch": [4], "features_extractor_class": Scaled}}, lambda env: env),
-    "total return": ({"baseline": "mean", "reward_to_go": False, **EXTENTS["steps"]}, lambda env: env),
-    "normalized": ({"normalize_advantage": True, "normalize_by": "episodes", **EXTENTS["episodes"]}, VecNormalize),
-    "schedules": ({"temperature": lambda left: 1 + left, "learning_rate": lambda left: 0.01 * left}, VecNormalize),
-    "fewer episodes than processes": ({"n_steps": None, "n_episodes": 2}, lambda env: env),
-    "recurrent": ({"n_episodes": 5, "baseline": "value"}, lambda env: env),
-    "recurrent steps": ({"n_steps": 5, "baseline": "value"}, lambda env: env),
+EXTENTS = {"steps": {"n_steps": 12}, "episodes": {"n_steps": None, "n_episodes": 7}}
+MEMORY = {"baseline": "value", "policy_kwargs": {"lstm_hidden_size": 4, "net_arch": [4]}}
+SHARED_EXTRACTOR = {"net_arch": [4], "features_extractor_class": Scaled}
+ROLLOUTS = {f"{name} {extent}": {"baseline": name, **EXTENTS[extent]} for name in BASELINES for extent in EXTENTS} | {
+    "shared extractor": {"policy_kwargs": SHARED_EXTRACTOR},
+    "total return": {"baseline": "mean", "reward_to_go": False, **EXTENTS["steps"]},
+    "normalized": {"normalize_advantage": True, "normalize_by": "episodes", **EXTENTS["episodes"]},
+    "schedules": {"temperature": lambda left: 1 + left, "learning_rate": lambda left: 0.01 * left},
+    "fewer episodes than processes": {"n_steps": None, "n_episodes": 1},
+    "recurrent episodes": {"n_episodes": 7, **MEMORY},
+    "recurrent steps": {"n_steps": 5, **MEMORY},
 }
+WRAPPERS = {"normalized": VecNormalize, "schedules": VecNormalize}
 
 
-def corridors(n_envs, wrapper=lambda env: env, lengths=(2, 3, 4), reward=lambda t, action: float(action) - t, **kwargs):
-    return wrapper(make_vec_env(lambda: Corridor(lengths, reward, **kwargs), n_envs))
+def corridors(n_envs, lengths=(2, 3, 4), reward=lambda t, action: float(action) - t, **kwargs):
+    return make_vec_env(lambda: Corridor(lengths, reward, **kwargs), n_envs)
 
 
 def build(name, env):
-    kwargs, wrapper = ROLLOUTS[name]
+    kwargs = {"seed": 1, "device": "cpu", **ROLLOUTS[name]}
     if name.startswith("recurrent"):
-        policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [4]}
-        return RecurrentREINFORCE("MlpLstmPolicy", env, policy_kwargs=policy_kwargs, seed=1, device="cpu", **kwargs)
-    return make("steps", wrapper(env) if not isinstance(env, Replay) else env, seed=1, **kwargs)
-
-
-def state_of(model):
-    return plain(model.policy.state_dict()), plain(model.get_parameters()), logged(model), model.num_timesteps
+        return RecurrentREINFORCE("MlpLstmPolicy", env, **kwargs)
+    return make("steps", env if isinstance(env, Replay) else WRAPPERS.get(name, lambda env: env)(env), **kwargs)
 
 
 def learn_all(rank):
     """The rollouts and last states of all models, in this process."""
     answers = {}
     for name in ROLLOUTS:
-        model = build(name, corridors(1, truncate=True))
+        model = build(name, corridors(2, truncate=True))
         callback = RecordRollouts()
         model.learn(100, callback)
-        answers[name] = (*state_of(model), callback.rollouts)
+        answers[name] = model.get_parameters(), logged(model), model.num_timesteps, callback.rollouts
     return answers
 
 
 @pytest.fixture(scope="module")
-def of_three_processes(tmp_path_factory):
-    return in_processes(3, learn_all, tmp_path_factory.mktemp("group"))
+def of_two_processes(tmp_path_factory):
+    return in_processes(2, learn_all, tmp_path_factory.mktemp("group"))
 
 
 @pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
 @pytest.mark.parametrize("name", ROLLOUTS)
-def test_reinforce_is_one_process_that_collects_the_same_rollouts(name, of_three_processes):
-    policy, *state, num_timesteps, rollouts = of_three_processes[0][name]
-    model = build(name, corridors(1, truncate=True))
+def test_reinforce_is_one_process_that_collects_the_same_rollouts(name, of_two_processes):
+    parameters, log, num_timesteps, rollouts = of_two_processes[0][name]
+    model = build(name, corridors(2, truncate=True))
     model = build(name, Replay(model, rollouts, starts_over=model.n_episodes is not None))
     callback = ActAsRecorded(rollouts)
     # Processes that have played their episodes make fewer steps than the environments of one process
     model.learn(100 if model.n_steps else 10**6, callback)
-    assert [*state_of(model)[:-1]] == [policy, *state]
-    assert [rollout.log for rollout in callback.rollouts] == [rollout.log for rollout in rollouts]
+    if name == "recurrent steps":
+        # The states that are carried on have been computed for two environments at once, and for four
+        for key, expected in parameters["policy"].items():
+            th.testing.assert_close(model.policy.state_dict()[key], expected, rtol=0, atol=1e-6)
+    else:
+        assert plain(model.get_parameters()) == plain(parameters) and logged(model) == log
+        assert [rollout.log for rollout in callback.rollouts] == [rollout.log for rollout in rollouts]
     assert len(rollouts) > 1 and 100 <= num_timesteps <= model.num_timesteps
-    for other in of_three_processes[1:]:
-        assert other[name][0] == policy and not other[name][-1]
+    # Callbacks of process 0 only, and its policy in both
+    assert not of_two_processes[1][name][-1]
+    assert plain(of_two_processes[1][name][0]["policy"]) == plain(parameters["policy"])
 
 
 @pytest.mark.parametrize("baseline", ["none", "leave_one_out"])
@@ -129,36 +138,42 @@ def test_the_expected_gradient_of_two_processes_is_exact(baseline, monkeypatch):
     enumeration.assert_equal(enumeration.expected_gradient(model), enumeration.gradient_of_return(model))
 
 
-def seen_seeds(rank):
-    model = make("steps", corridors(2, VecNormalize, (3,), reward=lambda t, action: float(t)), seed=10, n_steps=3)
+def of_the_union(rank, n_envs=2):
+    """In a task whose observations and rewards do not depend on the actions, and in one that is not seeded."""
+    env = VecNormalize(corridors(n_envs, (3,), lambda t, action: float(t)))
+    model = make("steps", env, seed=10, n_steps=3)
     model.learn(60)
-    moments = [(rms.mean, rms.var, rms.count) for rms in (model.env.obs_rms, model.env.ret_rms)]
-    return model.env.get_attr("np_random_seed"), model.num_timesteps, moments, len(model.ep_info_buffer)
+    model.learn(60, reset_num_timesteps=False)
+    moments = [(rms.mean, rms.var, rms.count) for rms in (env.obs_rms, env.ret_rms)]
+    th.manual_seed(0)
+    unseeded = make("steps", corridors(n_envs))
+    unseeded.learn(16)
+    seeds = env.get_attr("np_random_seed"), unseeded.env.get_attr("np_random_seed")
+    return model.num_timesteps, len(model.ep_info_buffer), moments, *seeds, th.rand(1).item()
 
 
 def test_seeds_steps_episodes_and_moments_are_those_of_one_process(tmp_path):
-    """In a task whose observations and rewards do not depend on the actions."""
-    model = make("steps", corridors(4, VecNormalize, (3,), lambda t, action: float(t)), seed=10, n_steps=3)
-    model.learn(60)
-    first, second = in_processes(2, seen_seeds, tmp_path)
-    assert first[0] + second[0] == model.env.get_attr("np_random_seed")
-    assert first[1] == second[1] == model.num_timesteps == 60
-    assert first[3] == len(model.ep_info_buffer) == 20
-    for rms, found, same in zip((model.env.obs_rms, model.env.ret_rms), first[2], second[2], strict=True):
-        for value, one, other in zip((rms.mean, rms.var, rms.count), found, same, strict=True):
+    n_steps, n_episodes, moments, seeds, *_ = of_the_union(0, 4)
+    first, second = in_processes(2, of_the_union, tmp_path)
+    assert first[0] == second[0] == n_steps == 120
+    assert first[1] == n_episodes == 40
+    assert first[3] + second[3] == seeds == [10, 11, 12, 13]
+    for expected, found, same in zip(moments, first[2], second[2], strict=True):
+        for value, one, other in zip(expected, found, same, strict=True):
             assert np.allclose(one, value, rtol=1e-9, atol=0) and np.array_equal(one, other)
+    assert {*first[4]}.isdisjoint(second[4]) and first[5] != second[5]
 
 
-def without_a_seed(rank):
-    th.manual_seed(0)
-    model = make("steps", corridors(2))
-    model.learn(16)
-    return [*model.env.get_attr("np_random_seed"), th.initial_seed()]
-
-
-def test_processes_without_a_seed_differ_even_if_the_script_seeds_pytorch(tmp_path):
-    first, second = in_processes(2, without_a_seed, tmp_path)
-    assert {*first}.isdisjoint(second)
+def test_moments_seen_since_are_exact_far_from_zero():
+    data = np.random.default_rng(0).normal(1e4, 1.0, (5000, 3))
+    after = RunningMeanStd(shape=(3,))
+    after.update(data[:4000])
+    before = after.copy()
+    after.update(data[4000:])
+    seen = seen_since(before, after)
+    assert seen.count == 1000
+    assert np.allclose(seen.mean, data[4000:].mean(0), rtol=1e-9)
+    assert np.allclose(seen.var, data[4000:].var(0), rtol=1e-6)
 
 
 class Acts(gym.Wrapper):
@@ -184,33 +199,24 @@ def send(number, *_):
 
 
 def named(rank, error):
-    return f"Process {rank} of 2 has stopped: {error}"
+    return ProcessError(f"Process {rank} of 2 has stopped: {error}")
 
 
-DEAD = "Process 1 of 2 has died, or ended without a message"
-# What happens in which process, and the errors of both
+DEAD = ProcessError("Process 1 of 2 has died, or ended without a message")
+INTERRUPTED = "KeyboardInterrupt"
+# What happens in which process, the errors of both, and with which kinds of updates
 STOPS = {
-    "callback returns False": (0, "callback", lambda model: False, (None, None)),
-    "callback raises": (0, "callback", fail, (OSError("broken"), ProcessError(named(0, "OSError: broken")))),
-    "environment raises": (1, "step", fail, (ProcessError(named(1, "OSError: broken")), OSError("broken"))),
-    "SIGINT": (
-        1,
-        "step",
-        partial(send, signal.SIGINT),
-        (ProcessError(named(1, "KeyboardInterrupt")), KeyboardInterrupt()),
-    ),
-    "SIGTERM": (
-        0,
-        "step",
-        partial(send, signal.SIGTERM),
-        (KeyboardInterrupt(), ProcessError(named(0, "KeyboardInterrupt"))),
-    ),
-    "SIGKILL": (1, "step", partial(send, signal.SIGKILL), (ProcessError(DEAD), None)),
-}
+    "callback returns False": (0, "callback", lambda model: False, (None, None), KINDS),
+    "callback raises": (0, "callback", fail, (OSError("broken"), named(0, "OSError: broken")), ["steps"]),
+    "environment raises": (1, "step", fail, (named(1, "OSError: broken"), OSError("broken")), KINDS),
+    "SIGINT": (1, "step", partial(send, signal.SIGINT), (named(1, INTERRUPTED), KeyboardInterrupt()), ["steps"]),
+    "SIGTERM": (0, "step", partial(send, signal.SIGTERM), (KeyboardInterrupt(), named(0, INTERRUPTED)), ["search"]),
+    "SIGKILL": (1, "step", partial(send, signal.SIGKILL), (DEAD, None), ["steps", "search"]),
+}  # fmt: skip
 
 
 def stop(rank, kind, name, folder):
-    where, how, act, _ = STOPS[name]
+    where, how, act, *_ = STOPS[name]
     env = make_vec_env(lambda: Acts(Corridor((3,)), act if (rank, how) == (where, "step") else lambda: None), 1)
     model = make(kind, env, seed=0, **({"n_episodes": 8} if kind == "episodes" else {}))
     error = None
@@ -226,18 +232,16 @@ def stop(rank, kind, name, folder):
     return repr(error), model._n_updates > 0, policy, [path.name for path in folder.glob("model*")]
 
 
-@all_kinds
-@pytest.mark.parametrize("name", STOPS)
+@pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, values in STOPS.items() for kind in values[-1]])
 def test_an_end_in_one_process_ends_all_and_leaves_the_last_good_model(name, kind, tmp_path):
-    answers = in_processes(2, partial(stop, kind=kind, name=name, folder=tmp_path), tmp_path)
-    errors = STOPS[name][-1]
-    assert answers[0][:2] == (repr(errors[0]), True) and answers[0][3] == ["model_0.zip"]
-    if name == "SIGKILL":
-        assert answers[1] is None
-    else:
-        assert answers[1][0] == repr(errors[1])
+    first, second = in_processes(2, partial(stop, kind=kind, name=name, folder=tmp_path), tmp_path)
+    errors = STOPS[name][3]
+    assert first[:2] == (repr(errors[0]), True) and first[3] == ["model_0.zip"]
+    assert second is None if name == "SIGKILL" else second[0] == repr(errors[1])
+    # Both have dropped the same rollout
+    assert name != "callback returns False" or first[2] == second[2]
     loaded = KINDS[kind][0].load(tmp_path / "model_0", env=Corridor((3,)), device="cpu")
-    assert plain(loaded.policy.state_dict()) == answers[0][2]
+    assert plain(loaded.policy.state_dict()) == first[2]
     loaded.learn(20)
 
 
@@ -251,15 +255,8 @@ def differ(rank, name):
 def test_processes_with_other_arguments_are_refused(name, tmp_path):
     first, second = in_processes(2, partial(differ, name=name), tmp_path)
     assert isinstance(first, ValueError) and "must be started with the same arguments" in str(first)
-    assert name in str(first) and "process 1" in str(first)
-    assert str(second) == str(first)
-
-
-def test_a_process_without_a_group_is_the_leader_and_the_switch_turns_a_group_off(tmp_path, monkeypatch):
-    assert is_leader()
-    assert in_processes(2, lambda rank: is_leader(), tmp_path) == [True, False]
-    monkeypatch.setenv("SB3_REINFORCE_PROCESSES", "0")
-    assert in_processes(2, lambda rank: is_leader(), tmp_path) == [True, True]
+    assert f"{name}=1" in str(second) or f"{name}=0.9" in str(second)
+    assert str(first) == str(second) and "process 1 has" in str(second)
 
 
 SCRIPT = """
