@@ -16,7 +16,8 @@ import torch.distributed as dist
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-WAIT_SECONDS = 20
+# Longer than a busy machine takes
+WAIT_SECONDS = 120
 
 
 def in_processes(size: int, function: Callable[[int], Any], folder: Path) -> list[Any]:
@@ -112,6 +113,7 @@ class Recorded:
     observations: np.ndarray
     actions: np.ndarray
     rewards: np.ndarray
+    values: np.ndarray
     columns: Any
     generators: tuple[Any, ...]
     log: dict[str, Any]
@@ -129,7 +131,7 @@ class RecordRollouts(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         buffer = self.locals["rollout_buffer"]
-        arrays = deepcopy((buffer.observations, buffer.actions, buffer.rewards, self.locals["columns"]))
+        arrays = deepcopy((buffer.observations, buffer.actions, buffer.rewards, buffer.values, self.locals["columns"]))
         self.rollouts.append(
             Recorded(*arrays, deepcopy((th.get_rng_state(), np.random.get_state())), logged(self.model))
         )
@@ -146,7 +148,10 @@ class ActAsRecorded(RecordRollouts):
         if len(self.rollouts) == len(self.given):
             return False
         row = self.locals["n_steps"]
-        self.locals["rollout_buffer"].actions[row] = self.given[len(self.rollouts)].actions[row]
+        given = self.given[len(self.rollouts)]
+        self.locals["rollout_buffer"].actions[row] = given.actions[row]
+        # The last bit of V depends on the number of environments that it is computed for at once
+        self.locals["rollout_buffer"].values[row] = given.values[row]
         return True
 
     def _on_rollout_end(self) -> None:
