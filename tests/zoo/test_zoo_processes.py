@@ -29,11 +29,11 @@ def test_train_in_two_processes_writes_one_folder(tmp_path):
         "--eval-freq",
         "500",
     ]
-    train = [*LAUNCHER, "-m", "sb3_reinforce.zoo", "train", *options, "--eval-episodes", "2"]
+    train = [*LAUNCHER, "-m", "sb3_reinforce.zoo", "train", *options, "--eval-freq", "500"]
     done = subprocess.run(train, check=True, capture_output=True, text=True)
     assert done.stdout.count("Saving to") == 1
     assert [path.name for path in (tmp_path / "logs/reinforce").iterdir()] == ["CartPole-v1_1"]
-    model = REINFORCE.load(tmp_path / "logs/reinforce/CartPole-v1_1/CartPole-v1")
+    model = REINFORCE.load(tmp_path / "logs/reinforce/CartPole-v1_1/CartPole-v1.zip")
     # The default entry has eight environments
     assert model.num_timesteps >= 2000 and (tmp_path / "logs/reinforce/CartPole-v1_1/7.monitor.csv").exists()
 
