@@ -168,7 +168,7 @@ class Model:
 
     def __init__(self) -> None:
         sizes = (1, 2, 4, 8, 32, 64)
-        costs = [run(1, "learn", "dummy", n, 0, [(0.0, {"n_rollouts": max(10, 200 // n)})])[0] for n in sizes]
+        costs = [run(1, "learn", "dummy", n, 0, [(0.0, {"n_rollouts": max(8, 100 // n)})])[0] for n in sizes]
         rollouts = [cost["steps"] / (N_STEPS * n) for n, cost in zip(sizes, costs, strict=True)]
         acting = [cost["stepping"] / N_STEPS / k for cost, k in zip(costs, rollouts, strict=True)]
         learning = [(cost["seconds"] - cost["stepping"]) / k for cost, k in zip(costs, rollouts, strict=True)]
@@ -200,6 +200,23 @@ class Model:
                 row = {"kind": "computed, 64 environments", "number": number, "milliseconds": milliseconds}
                 rows.append({**row, "rate": round(rate, 1)})
         return rows
+
+
+def tables(rows: pd.DataFrame) -> str:
+    """Medians of the steps a second, and of the seconds to the return, as tables in Markdown."""
+    text = ""
+    for column in ("rate", "seconds"):
+        medians = rows.pivot_table(column, "milliseconds", ["kind", "number"], aggfunc="median")
+        lines = [
+            ["ms a step", *(f"{kind}, {number}" for kind, number in medians)],
+            ["---"] * (len(medians.columns) + 1),
+        ]
+        lines += [
+            [f"{ms:g}", *(f"{value:,.0f}" if value > 100 else f"{value:.3g}" for value in values)]
+            for ms, values in medians.iterrows()
+        ]
+        text += f"\n{column}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return text
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
@@ -246,6 +263,7 @@ def main() -> None:
     unknown = rows.seconds.isna() & rows.wait_fraction.notna()
     rows.loc[unknown, "seconds"] = (rows.steps.median() / rows.rate[unknown]).round(2)
     rows.to_csv(arguments.output.with_suffix(".csv"), index=False)
+    print(tables(rows))
     draw(rows, arguments.output.with_suffix(".png"))
 
 
