@@ -79,6 +79,8 @@ class Running:
     def unless(self, starts: Bools) -> "Running":
         """The episodes that go on where none ``starts``; those of further environments are left out."""
         n_envs = len(starts)
+        if starts.all():
+            return Running.none(n_envs)
         return Running(np.where(starts, 0, self.timesteps[:n_envs]), np.where(starts, 0.0, self.rewards[:n_envs]))
 
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
