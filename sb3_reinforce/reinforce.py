@@ -27,6 +27,7 @@ from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
 from sb3_reinforce.envs.guards import guarded
+from sb3_reinforce.envs.starts import start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -86,6 +87,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. All environments are reset, and each
         contributes a number of episodes fixed beforehand; steps beyond them are made and counted, but not used
+    :param episodes_per_start: m > 1 lets the episodes of m neighbouring environments start from the same seed, and
+        ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
+        more than about half of the variance of the return lies between starts, which ``diagnostics.compare_starts``
+        measures. A rollout is then one episode of each environment
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
@@ -140,6 +145,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         max_grad_norm: float | None = 0.5,
         baseline: str | Baseline = "value",
         n_episodes: int | None = None,
+        episodes_per_start: int = 1,
         reward_to_go: bool = True,
         discount_scores: bool = False,
         normalize_by: str = "steps",
@@ -187,6 +193,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         )
         self.baseline = baseline
         self.n_episodes = n_episodes
+        self.episodes_per_start = episodes_per_start
         self.reward_to_go = reward_to_go
         self.discount_scores = discount_scores
         self.normalize_by = normalize_by
@@ -281,8 +288,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
         self.start_round()
+        if self.episodes_per_start > 1:
+            self._last_obs = start_groups(env, self.episodes_per_start)
+            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         # A measurement that failed in a callback leaves no observation
-        if self._last_obs is None or (n_rollout_steps is None and not np.all(self._last_episode_starts)):
+        elif self._last_obs is None or (n_rollout_steps is None and not np.all(self._last_episode_starts)):
             self._last_obs = env.reset()  # type: ignore[assignment]
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         if n_rollout_steps is None:
@@ -324,6 +334,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
                 reward_to_go=self.reward_to_go,
                 discount_scores=self.discount_scores,
                 normalize_by=self.normalize_by,
+                episodes_per_start=self.episodes_per_start,
             )
             is_collected = True
         except Exception:
@@ -437,6 +448,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         model = copy.copy(self)
         model.n_steps = None  # type: ignore[assignment]
         model.n_episodes = n_episodes
+        model.episodes_per_start = 1
         model.baseline = baseline or ("value" if self.has_critic else "none")
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))

@@ -21,7 +21,7 @@ from sb3_reinforce.policies.critic import values_after, values_along
 from sb3_reinforce.policies.evaluation import route_of
 
 GAMMA = 0.5
-ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normalize_by")
+ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normalize_by", "episodes_per_start")
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
 
 

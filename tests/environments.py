@@ -48,6 +48,25 @@ class Tree(gym.Env[np.ndarray, np.int64]):
         return found
 
 
+class Scales(gym.Env[np.ndarray, np.int64]):
+    """One step with the reward ``scale · x + (2a − 1) · effect``, where the start draws x = −1 or 1, unobserved."""
+
+    def __init__(self, scale: float = 1.0, effect: float = 1.0, ignores_seed: bool = False):
+        self.observation_space = spaces.Box(-1, 1, (1,))
+        self.action_space = spaces.Discrete(2)
+        self.scale, self.effect, self.ignores_seed = scale, effect, ignores_seed
+        self.x = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=None if self.ignores_seed else seed)
+        self.x = 2 * int(self.np_random.integers(2)) - 1
+        return np.full(1, self.x if self.ignores_seed else 1.0, dtype=np.float32), {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward = self.scale * self.x + (2 * int(action) - 1) * self.effect
+        return np.ones(1, dtype=np.float32), reward, True, False, {}
+
+
 class Corridor(gym.Env[np.ndarray, Any]):
     """Episodes of drawn lengths, whatever the action; the observation is the one-hot timestep."""
 

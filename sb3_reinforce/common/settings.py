@@ -26,6 +26,7 @@ from sb3_reinforce.common.arguments import (
     optional,
     unknown_name,
 )
+from sb3_reinforce.common.processes import place
 
 Functions = Mapping[str, Callable[..., Any]]
 
@@ -95,6 +96,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "vf_coef": partial(check_number, low=0),
     "baseline": check_name,
     "n_episodes": optional(check_count),
+    "episodes_per_start": check_count,
     "reward_to_go": check_flag,
     "discount_scores": check_flag,
     "normalize_by": partial(check_choice, choices=("steps", "episodes")),
@@ -148,15 +150,23 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
     check_function("baseline", model.baseline, baselines)
+    shares_starts = model.episodes_per_start > 1
+    n_all_envs = model.n_envs * place()[1]
     if model.n_steps is None and model.n_episodes is None:
-        model.n_steps = 32 if model.has_critic else None
-        model.n_episodes = None if model.has_critic else 16
+        model.n_steps = 32 if model.has_critic and not shares_starts else None
+        if model.n_steps is None:
+            model.n_episodes = n_all_envs if shares_starts else 16
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
     if model.n_episodes == 1 and model.baseline in ("leave_one_out", "optimal"):
         reason = f"baseline={model.baseline!r}, which is computed from the other episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
+    if shares_starts and (model.n_episodes != n_all_envs or model.n_envs % model.episodes_per_start):
+        raise ValueError(
+            f"episodes_per_start={model.episodes_per_start} needs a rollout of one episode of each environment, and a "
+            f"multiple of that number of environments: got n_episodes={model.n_episodes} and {n_all_envs} environments"
+        )
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
         got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
         raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")

@@ -10,6 +10,7 @@ from sb3_reinforce.diagnostics.estimator_comparison import EstimatorRow, compare
 from sb3_reinforce.diagnostics.gradient_check import CheckRow, CheckTable, check_gradient
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, Landscape, landscape
 from sb3_reinforce.diagnostics.sampling import sample
+from sb3_reinforce.diagnostics.start_comparison import StartReport, compare_starts
 from sb3_reinforce.diagnostics.statistics import GradientStatistics, gradient_statistics
 from sb3_reinforce.diagnostics.tables import Estimate, Table
 from sb3_reinforce.estimation.scores import gradients_by_episode
@@ -25,10 +26,12 @@ __all__ = [
     "GradientStatistics",
     "Landscape",
     "PitfallCallback",
+    "StartReport",
     "Table",
     "check_gradient",
     "compare_baselines",
     "compare_estimators",
+    "compare_starts",
     "gradient_statistics",
     "gradients_by_episode",
     "landscape",

@@ -4,6 +4,9 @@ Baselines: what is subtracted from the return before it weights a score. One pur
 A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. It keeps the gradient unbiased as long as
 b_t does not depend on the action at t or on its consequences (Williams, 1992, theorem 1). A user's own function is a
 baseline too.
+
+"Other episodes" are those of the same group: all of the rollout, or with ``episodes_per_start`` those from the same
+start. ``mean`` always takes all.
 """
 
 from collections.abc import Callable
@@ -96,7 +99,12 @@ def optimal(rollout: Rollout) -> th.Tensor:
     :param rollout: The rollout
     :return: b_t
     """
-    return ratio_of_others(*score_products(rollout))[rollout.episodes]
+    products, squares = score_products(rollout)
+    b = th.zeros_like(products)
+    for group in th.unique(rollout.groups):
+        members = th.unique(rollout.episodes[rollout.groups == group])
+        b[members] = ratio_of_others(products[members], squares[members])
+    return b[rollout.episodes]
 
 
 def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
@@ -127,13 +135,14 @@ def sum_of_others(x: th.Tensor) -> th.Tensor:
 
 
 def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
-    """The sum of G_t over the used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
-    _, group = th.unique(rollout.timesteps, return_inverse=True)
+    """The sum of G_t over the group's used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
+    place = rollout.timesteps + rollout.groups * (rollout.timesteps.max() + 1)
+    _, place = th.unique(place, return_inverse=True)
     used = rollout.used.to(rollout.returns)
-    zeros = used.new_zeros(int(group.max()) + 1)
-    totals = zeros.index_add(0, group.flatten(), (rollout.returns * used).flatten())
-    counts = zeros.index_add(0, group.flatten(), used.flatten())
-    return totals[group], counts[group]
+    zeros = used.new_zeros(int(place.max()) + 1)
+    totals = zeros.index_add(0, place.flatten(), (rollout.returns * used).flatten())
+    counts = zeros.index_add(0, place.flatten(), used.flatten())
+    return totals[place], counts[place]
 
 
 BASELINES: dict[str, Baseline] = {

@@ -32,6 +32,7 @@ def complete_rollout(
     reward_to_go: bool,
     discount_scores: bool,
     normalize_by: str,
+    episodes_per_start: int = 1,
 ) -> Rollout:
     """
     m_t, G_t, γ^t and D of what was collected; ``G_t − b_t`` and what a critic is fitted to are written to the buffer.
@@ -66,6 +67,7 @@ def complete_rollout(
         next_values=None if next_values is None else th.as_tensor(next_values).double(),
         policy=policy,
         denominator=denominator,
+        episodes_per_start=episodes_per_start,
         state=state,
     )
     buffer.advantages = compute_advantages(rollout, baseline(rollout))

@@ -15,6 +15,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
@@ -94,7 +95,8 @@ def evaluate_candidates(
     size = max(1, len(queue)) if seeds is None else env.num_envs
     for first in range(0, len(queue), size):
         tracker = EpisodeTracker(queue[first : first + size], env.num_envs, max_episode_steps)
-        obs = start_episodes(env, tracker.pairs, seeds)
+        starts = None if seeds is None else np.array([seeds[pair] for pair in tracker.pairs])
+        obs = start_episodes(env, starts)
         check_finite("The observation", obs, (None,))
         started = list(range(len(tracker.pairs)))
         # any() costs several times as much on a few numbers
@@ -109,20 +111,3 @@ def evaluate_candidates(
             if np.count_nonzero(finished):
                 started = tracker.finish(finished, returns)
     return returns
-
-
-def start_episodes(env: VecEnv, pairs: list[Pair], seeds: np.ndarray | None) -> Any:
-    """The first observations of episodes, environment i with the seed ``seeds[pairs[i]]``."""
-    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
-    # all that follows, which goes through every wrapper, continues its random numbers
-    if seeds is not None:
-        starts = np.array([seeds[pair] for pair in pairs])
-        for seed in np.unique(starts).tolist():
-            try:
-                env.env_method("reset", seed=seed, indices=np.flatnonzero(starts == seed).tolist())
-            except NotImplementedError as error:
-                raise ValueError(
-                    "Candidates that are to start from the same seeds need env_method('reset', seed=...), which "
-                    f"{type(env.unwrapped).__name__} does not have here: set common_random_numbers=False"
-                ) from error
-    return env.reset()

@@ -2,14 +2,16 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
+from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -29,3 +31,12 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
         obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     model._last_obs = obs  # type: ignore[assignment]
+
+
+def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
+    """Let the next rollout of a model consist of episodes from given seeds, and return their first observations."""
+    env = cast(VecEnv, model.env)
+    obs = start_episodes(env, seeds)
+    model._last_obs = obs
+    model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+    return obs

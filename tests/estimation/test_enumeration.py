@@ -10,6 +10,7 @@ from enumeration import (
     assert_equal,
     discounted_return,
     episode_terms,
+    estimate,
     expectation,
     expected_gradient,
     gradient_of_return,
@@ -62,6 +63,31 @@ def test_value_is_unbiased_whatever_the_critic_says():
 def test_time_mean_is_short_by_one_nth(reward_to_go, n_episodes):
     model = make_model(baseline="time_mean", reward_to_go=reward_to_go, n_episodes=n_episodes)
     assert_equal(expected_gradient(model, n_episodes), (n_episodes - 1) / n_episodes * gradient_of_return(model))
+
+
+@pytest.mark.parametrize(
+    ("baseline", "m", "ragged", "factor"),
+    [
+        ("leave_one_out", 2, False, 1),
+        ("leave_one_out", 3, True, 1),
+        ("optimal", 2, True, 1),
+        ("time_mean", 2, False, 1 / 2),
+    ],
+)
+def test_groups_that_share_their_start(baseline, m, ragged, factor):
+    """Given two starts, whose rewards have the scales 1 and 10, the expectation is the mean of their gradients."""
+    model = make_model(ragged, baseline=baseline, n_episodes=2 * m)
+    model.episodes_per_start = m
+    scales = (1.0,) * m + (10.0,) * m
+    total = 0.0
+    for batch in product(model.env.envs[0].unwrapped.trajectories(), repeat=2 * m):
+        log_p = th.stack([log_pi(LOGITS, node, action) for episode in batch for node, action, _ in episode]).sum()
+        scaled = [
+            [(node, action, scale * reward) for node, action, reward in episode]
+            for scale, episode in zip(scales, batch, strict=True)
+        ]
+        total = total + log_p.exp() * estimate(model, scaled)[0]
+    assert_equal(total, factor * 5.5 * gradient_of_return(model))
 
 
 def test_mean_is_biased_as_documented():

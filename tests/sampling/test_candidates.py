@@ -17,14 +17,12 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce.common.tensors import stack, take
+from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import set_temperature
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor
-from sb3_reinforce.sampling.candidates import (
-    evaluate_candidates,
-    start_episodes,
-)
+from sb3_reinforce.sampling.candidates import evaluate_candidates
 
 BOX = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
@@ -213,11 +211,10 @@ WRAPPERS = {
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_equal_seeds_are_equal_starts_in_every_environment_and_at_every_time(name):
     env = WRAPPERS[name]()
-    seeds = np.array([[11], [11], [12], [12], [11], [13]])
-    first = start_episodes(env, [(0, 0), (1, 0), (2, 0)], seeds)
+    first = start_episodes(env, np.array([11, 11, 12]))
     for _ in range(5):
         env.step(np.zeros((3, 1), dtype=np.float32))
-    second = start_episodes(env, [(3, 0), (4, 0), (5, 0)], seeds)
+    second = start_episodes(env, np.array([12, 11, 13]))
     env.close()
     assert np.array_equal(first[0], first[1]) and np.array_equal(first[0], second[1])
     assert np.array_equal(first[2], second[0])

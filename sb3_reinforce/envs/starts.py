@@ -1,0 +1,44 @@
+"""Episodes that start from given seeds."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+
+def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
+    """The first observations of episodes, environment i with the seed ``seeds[i]``."""
+    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
+    # all that follows, which goes through every wrapper, continues its random numbers
+    if seeds is not None:
+        for seed in np.unique(seeds).tolist():
+            try:
+                env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
+            except NotImplementedError as error:
+                raise ValueError(
+                    "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
+                    f"{type(env.unwrapped).__name__} does not have here: set common_random_numbers=False for a "
+                    "FiniteDifference, episodes_per_start=1 for a REINFORCE"
+                ) from error
+    return env.reset()
+
+
+def start_groups(env: VecEnv, size: int) -> Any:
+    """The first observations of episodes, each start of which ``size`` neighbouring environments share."""
+    seeds = th.randint(2**31, (env.num_envs // size,)).numpy()
+    obs = start_episodes(env, seeds.repeat(size))
+    check_groups(obs, size)
+    return obs
+
+
+def check_groups(obs: Any, size: int) -> None:
+    """Refuse first observations that differ between ``size`` neighbours, which had the same seed."""
+    for part in obs.values() if isinstance(obs, dict) else [obs]:
+        by_start = part.reshape(-1, size, *part.shape[1:])
+        if not np.array_equal(by_start, np.broadcast_to(by_start[:, :1], by_start.shape)):
+            raise ValueError(
+                "Episodes cannot share their start: after reset(seed=...) with the same seed and another reset, the "
+                "observations differ. The environment must draw all random numbers from self.np_random"
+            )

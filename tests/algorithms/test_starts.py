@@ -1,0 +1,111 @@
+"""Groups of episodes that share their start."""
+
+import runpy
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from environments import Scales
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_reinforce import REINFORCE, GymnasiumVecEnv
+from sb3_reinforce.estimation import BASELINES
+
+ENVS = {
+    "DummyVecEnv": lambda: make_vec_env("Pendulum-v1", 6, seed=0),
+    "VecNormalize": lambda: VecNormalize(make_vec_env("Pendulum-v1", 6)),
+    "GymnasiumVecEnv": lambda: GymnasiumVecEnv(
+        gym.make_vec("Pendulum-v1", 6, vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP})
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_groups_share_their_starts_and_rollouts_do_not(name):
+    env = ENVS[name]()
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=3, seed=0)
+    starts = []
+    model.learn(2 * 1200, callback=Starts(starts))
+    env.close()
+    for rows in starts:
+        assert (rows[:3] == rows[0]).all() and (rows[3:] == rows[3]).all()
+    assert len({rows[i].tobytes() for rows in starts for i in (0, 3)}) == 4
+
+
+class Starts:
+    """Keeps the first observations of each rollout."""
+
+    def __init__(self, found):
+        self.found = found
+
+    def __call__(self, locals_, globals_):
+        if locals_["n_steps"] == 0:
+            self.found.append(locals_["self"].rollout_buffer.observations[0].copy())
+        return True
+
+
+def test_baselines_compare_within_the_group():
+    """Returns 10 x ± 1 of one step: the others of the group are those with the same x."""
+    model = REINFORCE(
+        "MlpPolicy", DummyVecEnv([lambda: Scales(10.0)] * 8), baseline="none", episodes_per_start=4, seed=1
+    ).learn(8)
+    rollout = model.rollout
+    returns = rollout.returns[0].reshape(2, 4)
+    assert (rollout.groups[0].reshape(2, 4) == th.tensor([[0], [1]])).all()
+    assert (returns > 0).any(1).eq((returns > 0).all(1)).all()
+    mean = returns.mean(1, keepdim=True).expand(2, 4).flatten()
+    th.testing.assert_close(BASELINES["time_mean"](rollout)[0], mean)
+    th.testing.assert_close(BASELINES["leave_one_out"](rollout)[0], (4 * mean - rollout.returns[0]) / 3)
+    assert ((BASELINES["optimal"](rollout)[0].reshape(2, 4) - returns).abs() <= 2.001).all()
+
+
+def test_the_same_seed_gives_the_same_run_and_a_saved_model_goes_on(tmp_path):
+    def run():
+        env = make_vec_env(Scales, 8, seed=0)
+        return REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0).learn(80)
+
+    first, second = run(), run()
+    for name, values in first.policy.state_dict().items():
+        assert th.equal(values, second.policy.state_dict()[name])
+    first.save(tmp_path / "model")
+    loaded = REINFORCE.load(tmp_path / "model", env=first.env)
+    assert loaded.episodes_per_start == 2
+    loaded.learn(16)
+
+
+def test_dicts_are_compared_key_by_key():
+    class Dicts(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = spaces.Dict({"a": env.observation_space, "b": env.observation_space})
+
+        def observation(self, obs):
+            return {"a": obs, "b": 1 - np.abs(obs)}
+
+    env = DummyVecEnv([lambda: Dicts(Scales())] * 4)
+    REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2).learn(8)
+
+
+def test_what_cannot_share_its_start_is_refused():
+    env = DummyVecEnv([lambda: Scales(ignores_seed=True)] * 8)
+    with pytest.raises(ValueError, match="cannot share their start"):
+        REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0).learn(8)
+    for kwargs in ({"n_episodes": 16}, {"n_steps": 8}, {"episodes_per_start": 3}):
+        with pytest.raises(ValueError, match=r"episodes_per_start=. needs a rollout of one episode"):
+            REINFORCE("MlpPolicy", env, **{"episodes_per_start": 4, **kwargs})
+
+
+@pytest.mark.slow
+def test_half_of_the_episodes_do_where_starts_differ():
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "14_common_starts.py"))
+    better = 0
+    for seed in range(5):
+        alone = example["cost_by_episodes"](example["make_model"](1, seed))
+        grouped = example["cost_by_episodes"](example["make_model"](8, seed), 2)
+        better += grouped[-1] <= alone[-1]
+    assert better >= 4

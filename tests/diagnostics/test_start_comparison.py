@@ -1,0 +1,65 @@
+"""The share of the variance between starts, and what groups would gain, on a task where both are known."""
+
+import numpy as np
+import pytest
+from environments import Scales
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import compare_starts
+
+
+def make_model(n_envs=16, **kwargs):
+    # A policy that hardly learns stays uniform
+    env = DummyVecEnv([lambda: Scales(**kwargs)] * n_envs)
+    return REINFORCE("MlpPolicy", env, baseline="leave_one_out", seed=0)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_the_share_and_the_gains_are_found(scale):
+    """
+    With rewards ``scale · x ± 1`` the share is ``scale² / (scale² + 1)``.
+
+    For a uniform policy ĝ is proportional to the mean of ``e_i A_i`` with e_i = ±1: alone, A_i = scale · x + e_i has
+    the variance scale²; in a group, the mean of ``1 − e_i mean_{j≠i} e_j`` has ``2 / (m (m − 1))``.
+    """
+    report = compare_starts(make_model(scale=scale), n_starts=200, confidence=0.99)
+    assert report.share.low <= scale**2 / (scale**2 + 1) <= report.share.high
+    assert report.share.high - report.share.low < 0.3
+    for m, gain in report.gains.items():
+        # The baseline of independent episodes is a mean of 199 returns
+        expected = (scale**2 + (scale**2 + 1) / 199) * (m - 1) / 2
+        assert gain.low <= expected <= gain.high
+        assert gain.high < 4 * gain.low
+
+
+@pytest.mark.parametrize("n_envs", [1, 3, 16])
+def test_starts_are_the_same_whatever_the_number_of_environments(n_envs):
+    """Eight episodes of a start follow each other over the environments; 3 of them need a multiple of 3 starts."""
+    report = compare_starts(make_model(n_envs, scale=1000.0), n_starts=6)
+    assert report.share.value > 0.999
+
+
+def test_the_model_is_left_as_it_was():
+    model = make_model()
+    before = model.policy.state_dict()["action_net.weight"].clone()
+    compare_starts(model, n_starts=4)
+    assert (model.policy.state_dict()["action_net.weight"] == before).all()
+    assert model.num_timesteps == 0 and model.rollout is None and model.episodes_per_start == 1
+    model.learn(64)
+
+
+def test_what_cannot_be_compared_is_refused():
+    model = make_model(ignores_seed=True)
+    with pytest.raises(ValueError, match="cannot share their start"):
+        compare_starts(model)
+    with pytest.raises(ValueError, match="n_starts must be"):
+        compare_starts(make_model(), n_starts=3)
+    with pytest.raises(TypeError, match="model must be a REINFORCE"):
+        compare_starts(None)
+
+
+def test_the_report_can_be_read():
+    text = str(compare_starts(make_model(), n_starts=8))
+    assert "between starts" in text and all(f"episodes_per_start={m}" in text for m in (2, 4, 8))
+    assert np.isfinite(compare_starts(make_model(scale=0.0), n_starts=8).share.value)
