@@ -3,7 +3,7 @@ What a comparison shows: tables, and pictures by rliable (intervals are 95 % of 
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 
-Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds, a row per task) and
+Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds) and
 results_summary.png (interquartile mean, performance profiles and probability of improvement over all tasks), and prints
 the final evaluations as a Markdown table. In the summary 0 is a random policy and 1 the Zoo's published PPO; it has the
 algorithms that were run on every task.
@@ -19,6 +19,8 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from rliable import library, metrics
 from scipy.stats import trim_mean
+
+from sb3_reinforce.diagnostics.plots import COLOURS
 
 REPETITIONS = 2000
 LABELS = {
@@ -61,23 +63,32 @@ def iqm_of_points(scores: np.ndarray) -> np.ndarray:
 
 def draw_curves(results: pd.DataFrame, clock: str) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
-    figure, rows = plt.subplots(len(tasks), 2, figsize=(9, 2.6 * len(tasks)), layout="constrained", squeeze=False)
-    for axes, ((task, budget), runs) in zip(rows, tasks, strict=True):
+    n_rows = (len(tasks) + 1) // 2
+    figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
+    pairs = grid.reshape(-1, 2)
+    for axes, ((task, budget), runs) in zip(pairs, tasks, strict=False):
         for algorithm, mine in runs.groupby("algorithm", sort=False):
             seconds = mine[mine["evaluation"] == "final"][clock].median()
             for axis, column, end in zip(axes, ("steps", clock), (budget, seconds), strict=True):
                 points, iqm, (low, high) = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
-        axes[0].set(title=task, xlabel="steps", ylabel="return")
+        axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
         axes[1].set(title=task, xlabel="seconds of training", xscale="symlog")
+    for axis in pairs[len(tasks) :].flat:
+        axis.set_axis_off()
     # An algorithm need not have been run on the first task
-    lines = {line.get_label(): line for axis in rows[:, 0] for line in axis.get_lines()}
-    figure.legend(handles=list(lines.values()), loc="outside upper center", ncols=len(lines), frameon=False)
+    lines = {line.get_label(): line for axis in pairs[:, 0] for line in axis.get_lines()}
+    seeds = results.groupby(["task", "algorithm"])["seed"].nunique()
+    n_seeds = " to ".join(str(count) for count in sorted({seeds.min(), seeds.max()}))
+    title = f"Interquartile mean of {n_seeds} seeds with 95 % bootstrap intervals"
+    figure.legend(
+        handles=list(lines.values()), loc="outside upper center", ncols=len(lines), frameon=False, title=title
+    )
 
 
 def color(algorithm: str) -> str:
-    return f"C{list(LABELS).index(algorithm)}" if algorithm in LABELS else "black"
+    return COLOURS[list(LABELS).index(algorithm)] if algorithm in LABELS else "black"
 
 
 def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
