@@ -49,5 +49,5 @@ python_use_unqualified_type_names = True
 
 doctest_test_doctest_blocks = "default"
 # Before the lesson is written in the percent format
-suppress_warnings = ["toc.empty_glob"]
+suppress_warnings = ["toc.glob"]
 linkcheck_anchors_ignore_for_url = [r"https://github\.com/.*"]
