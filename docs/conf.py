@@ -44,10 +44,7 @@ autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
 autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True, "undoc-members": True, "no-value": True, "show-inheritance": True}
-# Names of the lists are those of their packages, not of the modules that define them
 python_use_unqualified_type_names = True
 
 doctest_test_doctest_blocks = "default"
-# Before the lesson is written in the percent format
-suppress_warnings = ["toc.glob"]
 linkcheck_anchors_ignore_for_url = [r"https://github\.com/.*"]

@@ -1,10 +1,12 @@
-"""Fails the build if a page is missing for a public name of the package."""
+"""Signatures of public classes as Python sees them, and a check that a page documents every public name."""
 
 import importlib
+import inspect
 
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util import logging
+from sphinx.util.inspect import stringify_signature
 
 PACKAGES = (
     "sb3_reinforce",
@@ -31,7 +33,17 @@ def check(_: Sphinx, env: BuildEnvironment) -> None:
             logger.warning("no page documents %s", name)
 
 
+def signature_of(
+    app: Sphinx, what: str, name: str, thing: object, options: object, signature: str, returned: str
+) -> tuple[str, str] | None:
+    """The arguments of ``__init__`` for a class with a ``__new__`` that only hands them on."""
+    if what != "class" or not str(signature).startswith("(*args"):
+        return None
+    return stringify_signature(inspect.signature(thing), show_annotation=False), returned
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Check once all pages are read."""
+    app.connect("autodoc-process-signature", signature_of)
     app.connect("env-check-consistency", check)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
