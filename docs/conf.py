@@ -31,7 +31,7 @@ myst_substitutions = tables.all_tables()
 
 # The lesson's pages are examples/*.py. A page is executed again only when its code has changed
 lesson.copy_pages(HERE.parent / "examples", HERE / "lesson")
-nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
+nb_custom_formats = {".py": "lesson.read"}
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True

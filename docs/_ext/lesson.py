@@ -3,6 +3,9 @@
 import re
 from pathlib import Path
 
+import jupytext
+from nbformat import NotebookNode
+
 
 def copy_pages(source: Path, target: Path) -> None:
     """Copy the scripts that are pages, unless they are there already, and remove the pages of scripts that are gone."""
@@ -30,3 +33,11 @@ def links(page: str, script: str) -> str:
         f"# ---\n# Download this page as a {{nb-download}}`Jupyter notebook <{notebook}>`, or run it as a script:\n"
         f"# `python examples/{script}`\n"
     )
+
+
+def read(text: str) -> NotebookNode:
+    """A page as a notebook that says in which language it is, also where it is not executed."""
+    notebook = jupytext.reads(text, fmt="py:percent")
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook.metadata["language_info"] = {"name": "python", "pygments_lexer": "ipython3"}
+    return notebook
