@@ -92,14 +92,14 @@ for name, arguments in schedules.items():
 
     def watch(local, _, found=found):
         """Called after each step: the entropy after a tenth of the training, and at its end."""
-        if local["self"].num_timesteps in (2_000, 20_000):
+        if local["self"].num_timesteps in (1_000, 10_000):
             p = probabilities(local["self"], np.ones(1, dtype=np.float32))
             found.append(-float((p * p.clamp(min=1e-12).log()).sum()))
         return True
 
     env = make_vec_env(Arms, 8, seed=seed)
-    model = REINFORCE("MlpPolicy", env, learning_rate=0.02, policy_kwargs={"net_arch": []}, **arguments, **common)
-    model.learn(20_000, callback=watch)
+    model = REINFORCE("MlpPolicy", env, learning_rate=0.03, policy_kwargs={"net_arch": []}, **arguments, **common)
+    model.learn(10_000, callback=watch)
     p = probabilities(model, np.ones(1, dtype=np.float32)).tolist()
     print(f"{name:32s} entropy {found[0]:.2f}, then {found[1]:.2f}; π = {', '.join(f'{each:.2f}' for each in p)}")
 assert all(early > entropies["neither"][0] for early, _ in list(entropies.values())[1:])
@@ -133,7 +133,7 @@ class Corridor(gym.Env):
 
 env = make_vec_env(Corridor, 8, seed=seed)
 model = REINFORCE("MlpPolicy", env, gamma=1.0, learning_rate=0.01, policy_kwargs={"net_arch": []}, **common)
-model.learn(40_000)
+model.learn(30_000)
 right = probabilities(model, np.ones(1, dtype=np.float32))[1].item()
 length = np.mean([info["l"] for info in model.ep_info_buffer])
 print(f"π(right) = {right:.2f}, mean length of the last 100 episodes {length:.1f}")

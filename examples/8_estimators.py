@@ -96,6 +96,6 @@ assert few + 0.15 < many and many > 0.6
 
 # %%
 plane = th.stack([truth, th.randn(n, dtype=th.float64)])
-found = landscape(model, fans, plane, extent=8.0, n_points=11, n_episodes=20, seed=seed)
+found = landscape(model, fans, plane, extent=8.0, n_points=9, n_episodes=12, seed=seed)
 plot_landscape(found)
 plt.show()

@@ -45,8 +45,8 @@ def climb(rate, n_episodes, with_baseline, n_updates=200, n_runs=1000):
 settings = {
     "rate 0.5, 1 episode": (0.5, 1, False),
     "rate 0.01, 1 episode": (0.01, 1, False),
-    "rate 2, 20 episodes": (2.0, 20, False),
-    "rate 2, 20 episodes, baseline": (2.0, 20, True),
+    "rate 4, 20 episodes": (4.0, 20, False),
+    "rate 4, 20 episodes, baseline": (4.0, 20, True),
 }
 curves = {name: climb(*setting) for name, setting in settings.items()}
 figure, ax = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
@@ -57,13 +57,14 @@ ax.set(title="Mean of 1000 runs", xlabel="update", ylabel="π(Right)", ylim=(0.4
 ax.legend(frameon=False, fontsize="small")
 plt.show()
 large, small, batch, baseline = curves.values()
-assert large[-1] < 0.9 and baseline[-1] > 0.99
-assert baseline[20] > small[20] + 0.2 and baseline[-1] > batch[-1] + 0.01
+assert large[-1] < 0.9 and batch[-1] < 0.99 and baseline[-1] > 0.995
+assert baseline[20] > small[20] + 0.2
 
 # %% [markdown]
 # The large step with one episode ends on the wrong action in many runs. The small step gets there, slowly. Twenty
-# episodes allow the large step, and with a baseline no run is lost. For a gradient with the standard deviation
-# $\sigma_g$ and $T$ updates, theory recommends a rate of about $1 / (\sigma_g \sqrt T)$.
+# episodes allow a step eight times as large, and three runs in a hundred are lost. With a baseline none is. For a
+# gradient with the standard deviation $\sigma_g$ and $T$ updates, theory recommends a rate of about $1 / (\sigma_g
+# \sqrt T)$.
 #
 # ## How noisy is the gradient of a real run?
 #
@@ -115,9 +116,9 @@ class Scaled(gym.Env):
 arguments = {"baseline": "none", "n_episodes": 20, "max_grad_norm": None, "device": "cpu", "seed": seed}
 arguments["policy_kwargs"] = {"net_arch": [], "optimizer_class": th.optim.SGD}
 for normalize in (False, True):
-    models = [REINFORCE("MlpPolicy", Scaled(s), normalize_advantage=normalize, **arguments) for s in (1.0, 100.0)]
     steps = []
-    for model in models:
+    for scale in (1.0, 100.0):
+        model = REINFORCE("MlpPolicy", Scaled(scale), normalize_advantage=normalize, **arguments)
         before = model.policy.action_net.bias.detach().clone()
         steps.append((model.learn(1).policy.action_net.bias.detach() - before).norm().item())
     print(f"normalize_advantage={normalize}: lengths of the steps {steps[0]:.6f} and {steps[1]:.6f}")
