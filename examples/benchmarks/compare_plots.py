@@ -79,12 +79,15 @@ def draw_curves(results: pd.DataFrame, clock: str) -> None:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task
     lines = {line.get_label(): line for axis in pairs[:, 0] for line in axis.get_lines()}
-    seeds = results.groupby(["task", "algorithm"])["seed"].nunique()
-    n_seeds = " to ".join(str(count) for count in sorted({seeds.min(), seeds.max()}))
-    title = f"Interquartile mean of {n_seeds} seeds with 95 % bootstrap intervals"
-    figure.legend(
-        handles=list(lines.values()), loc="outside upper center", ncols=len(lines), frameon=False, title=title
-    )
+    legend = {"loc": "outside upper center", "ncols": len(lines), "frameon": False}
+    title = f"interquartile mean of {seeds_of(results)}, bands: 95 % bootstrap intervals"
+    figure.legend(handles=list(lines.values()), title=title, **legend)
+
+
+def seeds_of(results: pd.DataFrame) -> str:
+    """How many seeds the runs of a task and an algorithm have."""
+    counts = results.groupby(["task", "algorithm"])["seed"].nunique()
+    return f"{counts.min()} seeds" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()} seeds"
 
 
 def color(algorithm: str) -> str:
@@ -108,16 +111,18 @@ def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def draw_summary(scores: dict[str, np.ndarray]) -> None:
-    _, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    n_runs, n_tasks = next(iter(scores.values())).shape
+    figure.suptitle(f"{n_tasks} tasks, {n_runs} seeds; bars and bands are 95 % bootstrap intervals", fontsize="medium")
     means, intervals = library.get_interval_estimates(scores, metrics.aggregate_iqm, reps=REPETITIONS)
     draw_intervals(left, means, intervals)
-    left.set(xlabel="normalized return, interquartile mean")
+    left.set(title="All tasks together", xlabel="interquartile mean of the return\n(0: random, 1: published PPO)")
     thresholds = np.linspace(0, 1.2, 61)
     profiles, bands = library.create_performance_profile(scores, thresholds, reps=REPETITIONS)
     for name, profile in profiles.items():
         middle.plot(thresholds, profile, color=color(name), label=LABELS.get(name, name))
         middle.fill_between(thresholds, *bands[name], color=color(name), alpha=0.2, linewidth=0)
-    middle.set(xlabel="normalized return τ", ylabel="share of runs above τ")
+    middle.set(title="Performance profiles", xlabel="normalized return τ", ylabel="share of runs above τ")
     middle.legend(frameon=False, fontsize="small")
     others = {name: (scores.get("reinforce"), score) for name, score in scores.items() if name != "reinforce"}
     if "reinforce" not in scores or not others:
@@ -127,7 +132,7 @@ def draw_summary(scores: dict[str, np.ndarray]) -> None:
     chances, spans = library.get_interval_estimates(others, metrics.probability_of_improvement, reps=REPETITIONS)
     draw_intervals(right, chances, spans)
     right.axvline(0.5, color="grey", linestyle=":")
-    right.set(xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
+    right.set(title="Probability of improvement", xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
 
 
 def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[str, np.ndarray]) -> None:
