@@ -6,10 +6,10 @@
 
 # %%
 import gymnasium as gym
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_reinforce import REINFORCE, ActionMaskObservation
 
@@ -47,13 +47,13 @@ class Doors(gym.Env):
 # %% [markdown]
 # `ActionMaskObservation` puts the mask of `action_masks()`, as sb3-contrib's MaskablePPO calls it, into the
 # observation. `MaskedPolicy` gives forbidden actions the probability 0. No algorithm has to know of masks. An untrained
-# policy opens 50 / 40 = 1.25 doors without and about 50 / 11 = 4.5 doors with masks.
+# policy opens 50 / 40 = 1.25 doors without masks and about 50 / 11 = 4.5 doors with them.
 
 # %%
 means = {}
 for policy, wrapper in (("MlpPolicy", None), ("MaskedPolicy", ActionMaskObservation)):
     env = make_vec_env(Doors, n_envs=8, seed=seed, wrapper_class=wrapper)
-    model = REINFORCE(policy, env, gamma=0.0, seed=seed, device="cpu").learn(4_000)
-    means[policy], _ = evaluate_policy(model, env, n_eval_episodes=50)
-    print(f"{policy:12s} {means[policy]:4.1f} of 50 doors")
+    model = REINFORCE(policy, env, gamma=0.0, learning_rate=0.01, seed=seed, device="cpu").learn(4_000)
+    means[policy] = np.mean([episode["r"] for episode in model.ep_info_buffer][-40:])
+    print(f"{policy:12s} {means[policy]:4.1f} of 50 doors in the last 40 episodes")
 assert means["MaskedPolicy"] > 2 * means["MlpPolicy"]
