@@ -1,5 +1,6 @@
 """The site's settings. Build it with ``make docs``; no page needs the network."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -36,8 +37,9 @@ nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_execution_timeout = 180
-# Progress bars
+# Progress bars, which also say what Jupyter lacks for them
 nb_output_stderr = "remove"
+os.environ["PYTHONWARNINGS"] = "ignore::UserWarning:rich.live"
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
