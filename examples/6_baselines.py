@@ -75,7 +75,7 @@ plt.show()
 #
 # Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
 # baseline on the same 200 episodes. The ratio compares a baseline with "none" on the same resamples, so its interval is
-# much narrower than the ones of the two variances.
+# much narrower than the intervals of the two variances.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
@@ -89,10 +89,11 @@ plot_baselines(table)
 plt.show()
 
 # %% [markdown]
-# "optimal" is only the best *constant*, "time_mean" and "leave_one_out" depend on the step, "value" depends on the
-# state. Hollow markers are biased: "time_mean" contains the return that it is subtracted from, and so shrinks the
-# gradient of $N$ episodes of one length to $(N - 1) / N$, noise included; "leave_one_out" is the same without that
-# bias. The floor takes the best constant for each single component of the gradient.
+# "optimal" is only the best *constant*; "time_mean" and "leave_one_out" depend on the step, "value" on the state. Which
+# is best depends on the task. Here it is often the constant: long episodes have long scores, and the constant gives
+# them more weight. Hollow markers are biased: "time_mean" contains the return that it is subtracted from, and so
+# shrinks the gradient of $N$ episodes of one length to $(N - 1) / N$, noise included. "leave_one_out" is the same
+# without that bias. The floor takes the best constant for each single component of the gradient.
 
 # %%
 ratio = {row.baseline: row.ratio.value for row in table}

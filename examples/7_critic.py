@@ -62,8 +62,8 @@ plt.show()
 
 # %% [markdown]
 # An untrained critic says nothing of the future, so $\lambda = 0$ loses most of the gradient. A trained one gives
-# almost the same direction with far less noise. In between is the usual $\lambda = 0.95$. A critic that is no baseline
-# at first does no lasting harm at $\lambda = 1$; at $\lambda = 0$ the policy follows its errors.
+# almost the same direction with far less noise. The usual $\lambda = 0.95$ is in between. At $\lambda = 1$ a wrong
+# critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
