@@ -1,8 +1,8 @@
 # %% [markdown]
 # # What can go wrong, and who says so?
 #
-# `PitfallCallback` watches a training, changes nothing, and warns once about each of eight known pitfalls. A healthy
-# run hears nothing of it. Here are eight runs that each fall into one.
+# `PitfallCallback` watches a training, changes nothing, and warns once about each of eight known pitfalls. In a
+# healthy run it is silent. Here are eight runs that each fall into one.
 
 # %%
 import warnings

@@ -193,8 +193,8 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
         # Each estimator has a length of its own, so that no fan hides another
         x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
         colour = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
-        style = {"edgecolor": "black", "linewidth": 0.4, "width": 0.009}
-        ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, color=colour, label=name, **style)
+        arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
+        arrows.set(label=name, edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
     ax.set(xlabel="first direction, in multiples of its norm", ylabel="second direction")
     ax.set_title("Utility on a plane through θ (the dot), and directions\nof gradients (their lengths mean nothing)")
