@@ -12,14 +12,18 @@ import socket
 import time
 from contextlib import suppress
 from datetime import timedelta
-from multiprocessing import AuthenticationError
-from multiprocessing.connection import Client, Listener, wait
+from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 import torch.distributed as dist
 
+from sb3_reinforce.common.interruptions import uninterrupted
+
 # With the value 0, each process learns alone
 SWITCH = "SB3_REINFORCE_PROCESSES"
+# All processes connect within the first time, and each sends its key within the second
+CONNECT_SECONDS = 60.0
+KEY_SECONDS = 5.0
 # Within these times the cause of a signal arrives, and torchrun's SIGTERM after another process has ended
 CAUSE_SECONDS = 0.5
 SIGTERM_SECONDS = 5.0
@@ -27,6 +31,9 @@ SIGTERM_SECONDS = 5.0
 
 class ProcessError(RuntimeError):
     """Another process has stopped or died."""
+
+    # Whether Ctrl-C or SIGTERM has stopped it
+    is_interrupt = False
 
 
 class Finished(Exception):
@@ -53,7 +60,7 @@ def is_leader() -> bool:
 
 
 class Processes:
-    """The connections of process 0 with the others; ``with`` closes them, and tells the others of an error."""
+    """The connections of process 0 with the others; ``with`` makes and closes them, and sends on an error."""
 
     def __init__(self) -> None:
         if not dist.is_initialized():
@@ -64,9 +71,7 @@ class Processes:
         # Whether the others have yet to send their parts of a rollout, and the state that these started from
         self.in_round = False
         self.state: Any = None
-        self.connect()
         self.waited = 0.0
-        self.started = time.perf_counter()
 
     def __reduce__(self) -> Any:
         # A model that is saved or copied while it learns is alone
@@ -74,27 +79,42 @@ class Processes:
 
     def connect(self) -> None:
         """Connect process 0 with each other process, which proves by a key that it belongs to the group."""
+        # The time begins when all have called learn()
+        dist.barrier()
         invitation: list[Any] = [None]
         if self.rank == 0:
-            key = secrets.token_bytes(32)
-            listener = Listener(("", 0), backlog=self.size, authkey=key)
-            invitation = [(os.environ.get("MASTER_ADDR") or socket.gethostname(), listener.address[1], key)]
+            server = socket.create_server(("", 0), backlog=self.size)
+            host = os.environ.get("MASTER_ADDR") or socket.gethostname()
+            invitation = [(host, server.getsockname()[1], secrets.token_bytes(32))]
         dist.broadcast_object_list(invitation, src=0)
         host, port, key = invitation[0]
         if self.rank > 0:
-            self.lines[Client((host, port), authkey=key)] = 0
-            self.send(self.rank)
-        else:
-            with listener:
-                while len(self.lines) < self.size - 1:
-                    # A stranger may have found the port
-                    with suppress(AuthenticationError, EOFError, OSError):
-                        line = listener.accept()
-                        self.lines[line] = pickle.loads(line.recv_bytes())
-        for line in self.lines:
-            # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
-            with socket.fromfd(line.fileno(), socket.AF_INET, socket.SOCK_STREAM) as own:
-                own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            line = socket.create_connection((host, port), CONNECT_SECONDS)
+            line.sendall(key + self.rank.to_bytes(4, "big"))
+            self.add(line, 0)
+            return
+        end = time.monotonic() + CONNECT_SECONDS
+        with server:
+            while missing := {*range(1, self.size)} - {*self.lines.values()}:
+                left = end - time.monotonic()
+                if left <= 0:
+                    message = f"Process {min(missing)} has not connected to {host}:{port} within {CONNECT_SECONDS:g} s"
+                    raise ProcessError(message)
+                server.settimeout(left)
+                # A stranger may have found the port
+                with suppress(OSError):
+                    line, _ = server.accept()
+                    line.settimeout(KEY_SECONDS)
+                    sent = line.recv(len(key) + 4)
+                    if secrets.compare_digest(sent[:-4], key):
+                        self.add(line, int.from_bytes(sent[-4:], "big"))
+
+    def add(self, line: socket.socket, rank: int) -> None:
+        """Send and receive messages by a socket."""
+        line.settimeout(None)
+        # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.lines[Connection(line.detach())] = rank
 
     def send(self, data: Any) -> None:
         """Send to all others, or to process 0; the next ``receive`` names a process that this does not reach."""
@@ -112,7 +132,9 @@ class Processes:
         while missing and (ready := wait(missing, timeout)):
             for line in cast(Any, ready):
                 try:
-                    data = pickle.loads(line.recv_bytes())
+                    # The next message must begin where this one ends
+                    with uninterrupted:
+                        data = pickle.loads(line.recv_bytes())
                 except (EOFError, OSError, pickle.UnpicklingError) as error:
                     message = f"Process {self.lines[line]} of {self.size} has died, or ended without a message"
                     raise ProcessError(message) from error
@@ -140,6 +162,12 @@ class Processes:
         self.send(Finished(state))
 
     def __enter__(self) -> "Processes":
+        try:
+            self.connect()
+        except BaseException as error:
+            self.__exit__(type(error), error, None)
+            raise
+        self.started = time.perf_counter()
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
@@ -151,18 +179,21 @@ class Processes:
                 line.close()
 
     def fail(self, error: BaseException) -> None:
-        """Tell the others of an error, or of the end of another process that has led to it, which is raised instead."""
-        reason = f"{type(error).__name__}: {error}".removesuffix(": ")
-        told = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
-        if isinstance(error, KeyboardInterrupt):
+        """Send an error to the others; if the end of another process has led to it, send and raise this one instead."""
+        # BadData, which is one, is internal
+        name = "ValueError" if isinstance(error, ValueError) else type(error).__name__
+        reason = f"{name}: {error}".removesuffix(": ")
+        message = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
+        message.is_interrupt = isinstance(error, KeyboardInterrupt)
+        if message.is_interrupt:
             # torchrun sends SIGTERM where another process has ended; it may also have been interrupted as this one
             try:
                 self.receive(CAUSE_SECONDS)
             except Exception as cause:
-                if isinstance(cause, ProcessError) and KeyboardInterrupt.__name__ not in str(cause):
+                if isinstance(cause, ProcessError) and not cause.is_interrupt:
                     self.send(cause)
                     raise cause from error
-        self.send(error if isinstance(error, ProcessError) else told)
+        self.send(error if isinstance(error, ProcessError) else message)
         if isinstance(error, ProcessError) and dist.is_torchelastic_launched():
             # Later its SIGTERM would interrupt the script while it saves the model
             with suppress(KeyboardInterrupt):
