@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import wraps
+from itertools import zip_longest
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -12,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_reinforce.common.processes import Finished, Processes, is_leader, place
 from sb3_reinforce.common.settings import ATTRIBUTES
@@ -68,7 +70,9 @@ class Distributed(BaseAlgorithm):
             value = getattr(self, ATTRIBUTES.get(name, name))
             # Without the address of a function
             own[name] = getattr(value, "__qualname__", repr(value) if isinstance(value, SHARED) else str(type(value)))
-        own["policy"] += f" with {[(name, *each.shape) for name, each in self.policy.state_dict().items()]}"
+        own["policy"] += f" {self.policy}"
+        own["spaces"] = f"{self.observation_space} and {self.action_space}"
+        own["moments of VecNormalize"] = str([moments.mean.shape for moments in self._moments()])
         first, *others = cast(Processes, self._processes).exchange(own)
         for rank, other in enumerate(others, 1):
             for name in first:
@@ -106,9 +110,11 @@ class Distributed(BaseAlgorithm):
 
     def share_of(self, n_episodes: int) -> int:
         """How many episodes this process plays: the quotas of all W·n environments differ by at most 1."""
-        rank, size = (0, 1) if self._processes is None else place()
-        each, more = divmod(n_episodes, size * self.n_envs)
-        return each * self.n_envs + min(max(more - rank * self.n_envs, 0), self.n_envs)
+        processes = self._processes
+        if processes is None:
+            return n_episodes
+        each, more = divmod(n_episodes, processes.size * self.n_envs)
+        return each * self.n_envs + min(max(more - processes.rank * self.n_envs, 0), self.n_envs)
 
     def start_round(self) -> None:
         """Process 0 lets the others collect too."""
@@ -123,21 +129,26 @@ class Distributed(BaseAlgorithm):
             state = processes.state
             steps = self.num_timesteps - state["attributes"]["num_timesteps"]
             seen = [*map(seen_since, state["moments"], self._moments())]
-            processes.send((part, steps, self.ep_info_buffer, self.ep_success_buffer, seen, processes.waited))
+            processes.send((part, steps, (self.ep_info_buffer, self.ep_success_buffer), seen, processes.waited))
             return []
         parts = [part]
         reports = processes.receive()
         processes.in_round = False
         elapsed = time.perf_counter() - processes.started
         all_waited = processes.waited
-        for other_part, steps, episodes, successes, seen, waited in reports:
+        buffers: list[Any] = [(self.ep_info_buffer, self.ep_success_buffer)]
+        for other_part, steps, episodes, seen, waited in reports:
             parts.append(other_part)
             self.num_timesteps += steps
-            cast(Any, self.ep_info_buffer).extend(episodes)
-            cast(Any, self.ep_success_buffer).extend(successes)
+            buffers.append(episodes)
             for total, each in zip(self._moments(), seen, strict=True):
                 total.combine(each)
             all_waited += waited
+        for own, *others in zip(*buffers, strict=True):
+            # In turns from the last on, or the last process would fill the window
+            turns = [*zip_longest(*map(reversed, [own, *others]))]
+            own.clear()
+            own.extend(each for turn in reversed(turns) for each in reversed(turn) if each is not None)
         self.logger.record("time/wait_fraction", all_waited / (elapsed * processes.size))
         return parts
 
@@ -145,6 +156,11 @@ class Distributed(BaseAlgorithm):
         """Collect for process 0 until it has finished learning."""
         processes = cast(Processes, self._processes)
         self.set_logger(Logger(folder=None, output_formats=[]))
+        # Where the script has seeded or restored the generators, all would draw the same actions
+        seed = int(th.randint(2**31, ())) + processes.rank
+        set_random_seed(seed)
+        self.action_space.seed(seed)
+        # A list, with which log π is computed: the callbacks of process 0 may read it
         callback = self._init_callback([])
         try:
             self.adopt(*processes.receive())
