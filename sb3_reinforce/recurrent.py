@@ -171,7 +171,7 @@ class RecurrentREINFORCE(REINFORCE):
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
         if state is not None and self._next_state is not None:
             goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
-            state[:, 1] = self._next_state[:, 1] * goes_on[(...,) + (None,) * 3]
+            state[:, 1] = self._next_state[: len(state), 1] * goes_on[(...,) + (None,) * 3]
         rows = rows_of(obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), state)
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T

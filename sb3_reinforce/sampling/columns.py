@@ -43,7 +43,9 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
     # A process without a quota has waited for the end of an episode that does not count
     n_steps = max(len(columns.dones) for columns in all_columns if columns.quota.any())
     for name in ROWS:
-        setattr(buffer, name, side_by_side([rows[name] for _, rows in parts], n_steps))
+        # A policy may refuse observations of zeros
+        mode = "edge" if name == "observations" else "constant"
+        setattr(buffer, name, side_by_side([rows[name] for _, rows in parts], n_steps, mode))
     buffer.n_envs = buffer.rewards.shape[1]
     buffer.buffer_size = n_steps
     buffer.pos = n_steps
@@ -55,7 +57,7 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
     ]
     states = [columns.state for columns in all_columns if columns.state is not None]
     # A process whose environments all start episodes has none
-    state = [states[0] * 0 if columns.state is None else columns.state for columns in all_columns if states]
+    state = [th.zeros_like(states[0]) if columns.state is None else columns.state for columns in all_columns if states]
     return Columns(
         # An episode that ends behind the quota does not count, and the padding ends none
         dones=side_by_side([columns.dones for columns in all_columns], n_steps),
@@ -67,11 +69,11 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
     )
 
 
-def side_by_side(arrays: Sequence[Any], n_steps: int) -> Any:
-    """Arrays, or dicts of arrays, along the axis of the environments, cut or filled with zeros to ``n_steps`` rows."""
+def side_by_side(arrays: Sequence[Any], n_steps: int, mode: Any = "constant") -> Any:
+    """Arrays, or dicts of arrays, along the axis of the environments, cut or padded to ``n_steps`` rows."""
     if isinstance(arrays[0], dict):
-        return {key: side_by_side([part[key] for part in arrays], n_steps) for key in arrays[0]}
+        return {key: side_by_side([part[key] for part in arrays], n_steps, mode) for key in arrays[0]}
     columns = [rows[:n_steps] for rows in arrays]
     return np.concatenate(
-        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)]) for rows in columns], axis=1
+        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)], mode) for rows in columns], axis=1
     )
