@@ -13,7 +13,7 @@ the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``s
 written when it is finished, and a run that is there is not repeated: stop the script when you like and start it again.
 
 Under ``python -m torch.distributed.run --standalone --nproc-per-node W`` our runs collect in W processes, one run after
-the other, and process 0 makes those of the peers.
+the other, and process 0 trains the peers. The first error ends them all.
 """
 
 import argparse
@@ -42,6 +42,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_reinforce import is_leader
+from sb3_reinforce.common.processes import Processes, place
 from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
@@ -107,7 +108,8 @@ class Evaluations(BaseCallback):
         self.run, self.env, self.eval_env = run, env, eval_env
         self.rows: list[dict[str, Any]] = []
         self.twentieth = 0
-        self.spent, self.since = np.zeros(2), clocks()
+        self.spent = np.zeros(2)
+        self.since = clocks()
 
     def _on_step(self) -> bool:
         return True
@@ -184,13 +186,18 @@ def main() -> None:
         for seed, task, algorithm in itertools.product(arguments.seeds, arguments.tasks, arguments.algorithms)
         if settings_of(algorithm, task)
     ]
-    runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index)
+    runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index) if is_leader() else []
+    is_alone = place() == (0, 1)
+    if not is_alone:
+        with Processes() as processes:
+            runs = processes.exchange(runs)[0]
     if not runs:
         raise SystemExit(f"Nothing to do: {arguments.output} has the {len(wanted)} runs that there are settings for")
-    failed, start = [], time.perf_counter()
+    failed = []
+    start = time.perf_counter()
     with contextlib.ExitStack() as stack:
         map_runs: Any = map
-        if not th.distributed.is_torchelastic_launched():
+        if is_alone:
             pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes))
             map_runs = pool.imap_unordered
         elif not is_leader():
@@ -200,6 +207,9 @@ def main() -> None:
             minutes = (time.perf_counter() - start) / 60
             left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"
             if isinstance(outcome, Exception):
+                if not is_alone:
+                    # The other processes may be in another run
+                    raise outcome
                 result = repr(outcome)
                 failed.append(f"{run}: {result}")
             elif not is_leader():

@@ -63,7 +63,12 @@ class Watch(BaseCallback):
         super().__init__()
         self.target, self.n_rollouts = target, n_rollouts
         self.stepping = 0.0
-        self.start = self.rollout_start = self.last_step = time.perf_counter()
+        self.start = 0.0
+        self.rollout_start = 0.0
+        self.last_step = 0.0
+
+    def _on_training_start(self) -> None:
+        self.start = time.perf_counter()
 
     def _on_step(self) -> bool:
         self.last_step = time.perf_counter()
