@@ -65,7 +65,10 @@ class Replay(VecEnv):
     def __init__(self, model: Any, rollouts: Sequence[Any], starts_over: bool):
         n_envs = rollouts[0].columns.dones.shape[1]
         super().__init__(n_envs, model.observation_space, model.action_space)
-        self.rollouts, self.starts_over, self.number, self.row = rollouts, starts_over, 0, 0
+        self.rollouts = rollouts
+        self.starts_over = starts_over
+        self.number = 0
+        self.row = 0
 
     def reset(self) -> Any:
         return self.rollouts[self.number % len(self.rollouts)].observations[self.row]
@@ -74,7 +77,8 @@ class Replay(VecEnv):
         """Nothing to do."""
 
     def step_wait(self) -> Any:
-        rollout, row = self.rollouts[self.number % len(self.rollouts)], self.row
+        rollout = self.rollouts[self.number % len(self.rollouts)]
+        row = self.row
         infos = [
             {"TimeLimit.truncated": True, "terminal_observation": rollout.columns.terminal_obs[row, env]}
             if (row, env) in rollout.columns.terminal_obs
@@ -85,7 +89,8 @@ class Replay(VecEnv):
         last = self.row == len(rollout.observations)
         obs = rollout.columns.last_obs if last else rollout.observations[self.row]
         if last:
-            self.number, self.row = self.number + 1, 0
+            self.number += 1
+            self.row = 0
             if self.starts_over:
                 obs = self.reset()
         return obs, rollout.rewards[row], rollout.columns.dones[row], infos

@@ -80,7 +80,7 @@ def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
 
 
 def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
-    """A model, its environments and those of its evaluations, with a configuration that no other run shares."""
+    """A model, its environments and evaluation environments, with a configuration that no other run shares."""
     with contextlib.redirect_stdout(io.StringIO()):
         manager = (Experiment if run.algorithm in OURS else ExperimentManager)(
             argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
@@ -89,14 +89,14 @@ def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
         settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
         kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
         env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
-        # The same starts for all algorithms, other than those of the training
+        # The same starts for all algorithms, other than in training
         manager.seed = 10_000 + run.seed
         eval_env = manager.create_envs(EVALUATION_EPISODES, eval_env=True)
     return rl_zoo3.ALGOS[run.algorithm](env=env, seed=run.seed, device="cpu", **kwargs), env, eval_env
 
 
 def clocks() -> np.ndarray:
-    """The time of the day and that of this process, in seconds."""
+    """The time of the day and the time of this process, in seconds."""
     return np.array([time.perf_counter(), time.process_time()])
 
 

@@ -56,7 +56,7 @@ class Distributed(BaseAlgorithm):
     _processes: Processes | None = None
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed the generators and environments: ``seed`` plus the environment's index among those of all processes."""
+        """Seed the generators and environments: ``seed`` plus the environment's index among all W·n."""
         rank, _ = place()
         if rank > 0:
             # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions

@@ -18,7 +18,7 @@ class Columns:
     """
     What was collected besides the rows of the buffer; ``dones`` is of shape ``(n_steps, n_envs)``.
 
-    ``quota`` is the number of episodes that count in each environment, and ``state`` that of ``Rollout``.
+    ``quota`` is the number of episodes that count in each environment; ``state`` is as in ``Rollout``.
     """
 
     dones: Bools

@@ -47,7 +47,7 @@ class EpisodicUtility:
         columns = np.arange(len(thetas)) % n_columns
         seeds = (self.first_seed + columns[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
         processes = model._processes
-        # Of several processes each evaluates a part of the candidates
+        # Each process evaluates a part of the candidates
         own = slice(None) if processes is None else np.array_split(range(len(thetas)), processes.size)[processes.rank]
         returns = evaluate_candidates(
             self.actor,

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from functools import partial
@@ -11,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At
+from callbacks import At, Record
 from environments import Corridor
 from models import KINDS, Scaled, make, plain
 from processes import ActAsRecorded, RecordRollouts, Replay, in_processes, logged
@@ -19,8 +20,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_reinforce.common import processes
 from sb3_reinforce.common.distribution import seen_since
-from sb3_reinforce.common.processes import ProcessError
+from sb3_reinforce.common.processes import ProcessError, Processes
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.sampling.collection import ROWS
@@ -149,7 +151,8 @@ def of_the_union(rank, n_envs=2):
     unseeded = make("steps", corridors(n_envs))
     unseeded.learn(16)
     seeds = env.get_attr("np_random_seed"), unseeded.env.get_attr("np_random_seed")
-    return model.num_timesteps, len(model.ep_info_buffer), moments, *seeds, th.rand(1).item()
+    wait_fraction = model.logger.name_to_value.get("time/wait_fraction")
+    return model.num_timesteps, len(model.ep_info_buffer), moments, *seeds, th.rand(1).item(), wait_fraction
 
 
 def test_seeds_steps_episodes_and_moments_are_those_of_one_process(tmp_path):
@@ -162,6 +165,7 @@ def test_seeds_steps_episodes_and_moments_are_those_of_one_process(tmp_path):
         for value, one, other in zip(expected, found, same, strict=True):
             assert np.allclose(one, value, rtol=1e-9, atol=0) and np.array_equal(one, other)
     assert {*first[4]}.isdisjoint(second[4]) and first[5] != second[5]
+    assert 0 < first[6] < 1
 
 
 def test_moments_seen_since_are_exact_far_from_zero():
@@ -181,7 +185,8 @@ class Acts(gym.Wrapper):
 
     def __init__(self, env, act):
         super().__init__(env)
-        self.act, self.n_steps = act, 0
+        self.act = act
+        self.n_steps = 0
 
     def step(self, action):
         self.n_steps += 1
@@ -229,14 +234,15 @@ def stop(rank, kind, name, folder):
     # Alone
     os.environ["SB3_REINFORCE_PROCESSES"] = "0"
     model.learn(20, reset_num_timesteps=False)
-    return repr(error), model._n_updates > 0, policy, [path.name for path in folder.glob("model*")]
+    return repr(error), model._n_updates > 0, policy
 
 
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, values in STOPS.items() for kind in values[-1]])
 def test_an_end_in_one_process_ends_all_and_leaves_the_last_good_model(name, kind, tmp_path):
     first, second = in_processes(2, partial(stop, kind=kind, name=name, folder=tmp_path), tmp_path)
     errors = STOPS[name][3]
-    assert first[:2] == (repr(errors[0]), True) and first[3] == ["model_0.zip"]
+    assert first[:2] == (repr(errors[0]), True)
+    assert [path.name for path in tmp_path.glob("model*")] == ["model_0.zip"]
     assert second is None if name == "SIGKILL" else second[0] == repr(errors[1])
     # Both have dropped the same rollout
     assert name != "callback returns False" or first[2] == second[2]
@@ -245,18 +251,78 @@ def test_an_end_in_one_process_ends_all_and_leaves_the_last_good_model(name, kin
     loaded.learn(20)
 
 
+DIFFERENT = {"gamma": "gamma=0.9", "n_envs": "n_envs=1", "policy": "Tanh", "VecNormalize": "VecNormalize=[]"}
+
+
 def differ(rank, name):
     kwargs = {"gamma": 0.9 + 0.05 * rank} if name == "gamma" else {}
-    model = make("steps", corridors(1 + rank if name == "n_envs" else 1), **kwargs)
+    if name == "policy":
+        kwargs = {"policy_kwargs": {"activation_fn": [th.nn.Tanh, th.nn.ReLU][rank]}}
+    env = corridors(1 + rank if name == "n_envs" else 1)
+    model = make("steps", VecNormalize(env) if name == "VecNormalize" and rank else env, **kwargs)
     model.learn(10)
 
 
-@pytest.mark.parametrize("name", ["gamma", "n_envs"])
+@pytest.mark.parametrize("name", DIFFERENT)
 def test_processes_with_other_arguments_are_refused(name, tmp_path):
     first, second = in_processes(2, partial(differ, name=name), tmp_path)
     assert isinstance(first, ValueError) and "must be started with the same arguments" in str(first)
-    assert f"{name}=1" in str(second) or f"{name}=0.9" in str(second)
-    assert str(first) == str(second) and "process 1 has" in str(second)
+    assert str(first) == str(second) and DIFFERENT[name] in str(second) and "process 1 has" in str(second)
+
+
+def actions_of_all(rank, path):
+    """With restored generators, with the same seed in all, and after a callback has changed the policy."""
+    restored = KINDS["steps"][0].load(path, corridors(1), restore_random_state=True)
+    restored.learn(1)
+    seeded = make("steps", corridors(1), n_steps=32)
+    th.manual_seed(0)
+    seeded.learn(1)
+    changed = make("steps", corridors(1), n_steps=32)
+    always_1 = th.tensor([-50.0, 50.0])
+    changed.learn(128, Record(lambda model: model.policy.action_net.bias.data.copy_(always_1)))
+    return [model.rollout_buffer.actions[..., 0].T for model in (restored, seeded, changed)]
+
+
+def test_processes_draw_other_actions_and_take_over_what_a_callback_changes(tmp_path):
+    make("steps", corridors(1), n_steps=32, seed=0).save(tmp_path / "model")
+    (restored, seeded, changed), _ = in_processes(2, partial(actions_of_all, path=tmp_path / "model"), tmp_path)
+    assert (restored[0] != restored[1]).any() and (seeded[0] != seeded[1]).any() and (changed == 1).all()
+
+
+def returns_in_window(rank):
+    model = make("steps", corridors(2, (3,), lambda t, action: float(rank)), n_steps=3, stats_window_size=2)
+    model.learn(24)
+    return sorted(episode["r"] for episode in model.ep_info_buffer)
+
+
+def test_the_window_of_the_log_has_episodes_of_all_processes(tmp_path):
+    assert in_processes(2, returns_in_window, tmp_path)[0] == [0.0, 3.0]
+
+
+def meet(rank, is_reachable):
+    """A stranger, who sends nothing, connects before process 1."""
+    connect = socket.create_connection
+    strangers = []
+
+    def connect_after_stranger(*arguments):
+        strangers.append(connect(*arguments))
+        if not is_reachable:
+            raise OSError("unreachable")
+        return connect(*arguments)
+
+    socket.create_connection = connect_after_stranger
+    processes.KEY_SECONDS = 0.1
+    if not is_reachable:
+        processes.CONNECT_SECONDS = 1.0
+    with Processes() as group:
+        return group.exchange(rank)
+
+
+def test_process_0_waits_neither_for_strangers_nor_for_ever(tmp_path):
+    assert in_processes(2, partial(meet, is_reachable=True), tmp_path) == [[0, 1], [0, 1]]
+    first, second = in_processes(2, partial(meet, is_reachable=False), tmp_path)
+    assert isinstance(first, ProcessError) and "Process 1 has not connected to localhost:" in str(first)
+    assert repr(second) == repr(OSError("unreachable"))
 
 
 SCRIPT = """
