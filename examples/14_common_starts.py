@@ -49,8 +49,7 @@ def make_model(episodes_per_start: int, seed: int) -> REINFORCE:
 # %% [markdown]
 # ## Ask before you train
 # `compare_starts` plays eight episodes from each of some starts. It reports how much of the variance of the return
-# lies between starts, and what groups would do to the variance of the gradient. Where the share is below about one
-# half, as in CartPole, groups make the gradient *noisier*.
+# lies between starts, and by what groups would divide the variance of the gradient. Below 1 they make it *noisier*.
 
 # %%
 report = compare_starts(make_model(1, seed=0))

@@ -79,7 +79,7 @@ class RecurrentREINFORCE(REINFORCE):
         batch_size: int = 4096,
         **kwargs: Any,
     ):
-        if n_steps is None and n_episodes is None:
+        if n_steps is None and n_episodes is None and kwargs.get("episodes_per_start", 1) == 1:
             n_episodes = 16
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None

@@ -25,7 +25,13 @@ from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
+from sb3_reinforce.common.settings import (
+    INSTEAD_OF_PPO,
+    REINFORCE_ARGUMENTS,
+    check_learn,
+    check_reinforce,
+    check_starts,
+)
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
@@ -75,7 +81,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
-        32 steps for ``baseline="value"``, 16 episodes for the others
+        32 steps for ``baseline="value"``, 16 episodes for the others (with ``episodes_per_start``, one of each
+        environment)
     :param gamma: Discount factor
     :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
         ``baseline="value"`` and ``reward_to_go=True``
@@ -89,8 +96,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         contributes a number of episodes fixed beforehand; steps beyond them are made and counted, but not used
     :param episodes_per_start: m > 1 lets the episodes of m neighbouring environments start from the same seed, and
         ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
-        more than about half of the variance of the return lies between starts, which ``diagnostics.compare_starts``
-        measures. A rollout is then one episode of each environment
+        much of the variance of the return lies between starts: ask ``diagnostics.compare_starts``. A rollout is then
+        one episode of each environment
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
@@ -212,6 +219,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._running = Running.none(1)
         if _init_setup_model:
             self._setup_model()
+            check_starts(self)
 
     @property
     def has_critic(self) -> bool:
@@ -287,8 +295,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
+        check_starts(self)
         self.start_round()
         if self.episodes_per_start > 1:
+            self._last_obs = None
             self._last_obs = start_groups(env, self.episodes_per_start)
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         # A measurement that failed in a callback leaves no observation

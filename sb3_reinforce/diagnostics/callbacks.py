@@ -127,7 +127,8 @@ class GradientQualityCallback(Diagnosis):
     def measure(self, rollout: Rollout) -> dict[str, float]:
         """The figures of one rollout, before training on it."""
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
-        if n_episodes < 2:
+        # Episodes that share their start are not independent
+        if n_episodes < 2 or rollout.episodes_per_start > 1:
             return {}
         own_weights = training_weights(cast(REINFORCE, self.model))
         rollout = evenly_spread(rollout, self.max_episodes)
