@@ -6,7 +6,7 @@
 # −1, so a policy without a memory can do no better than 0. The likelihood ratio holds for partial observations as it
 # stands: only $\log \pi$ is differentiated, now back through the memory to the start of each episode.
 #
-# As a script it takes arguments: `python examples/13_memory.py --length 20 --memory lstm --timesteps 200000`.
+# As a script it takes arguments: `python examples/13_memory.py --length 20 --memory rnn --timesteps 200000`.
 
 # %%
 import argparse

@@ -54,8 +54,8 @@ by_name = {row.estimator: row.snr_per_step.value for row in table}
 assert by_name["likelihood_ratio"] == max(by_name.values())
 
 # %% [markdown]
-# Rules of thumb: differences along coordinates up to about 20 parameters, random directions from 20 to 500, and the
-# likelihood ratio wherever the policy can be differentiated.
+# Rules of thumb: a regression up to about 20 parameters, central differences from 20 to 500, and the likelihood ratio
+# wherever the policy can be differentiated.
 #
 # ## A picture
 #

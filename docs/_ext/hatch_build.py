@@ -8,7 +8,7 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 
 class AddressHook(MetadataHookInterface):
-    """Adds the links of the project, and makes those of the README absolute, as a package index needs them."""
+    """Adds the project's links, and makes the README's links absolute, as a package index needs them."""
 
     def update(self, metadata: dict[str, Any]) -> None:
         address = self.config["address"].rstrip("/")
