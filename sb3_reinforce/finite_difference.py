@@ -292,7 +292,7 @@ class FiniteDifference(BasePolicyGradient):
         return GradientEstimate(gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched)
 
     def collect_part(self, callback: BaseCallback) -> None:
-        # The perturbations are those of process 0, and the utility evaluates a part of them
+        # The utility evaluates this process's part of the perturbations, which all processes draw alike
         self.estimate_gradient(callback)
 
     @uninterrupted

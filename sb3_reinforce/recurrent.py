@@ -42,7 +42,7 @@ class RecurrentREINFORCE(REINFORCE):
     cut comes from one more step of its sequence. The critic's minibatches are whole sequences of about ``batch_size``
     steps.
 
-    ``policy_kwargs`` are those of sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
+    ``policy_kwargs`` as in sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
     ``shared_lstm``, ``lstm_kwargs``; ``memory`` is ``"lstm"``, ``"gru"`` or ``"rnn"``.
 
     To predict, hand the state on; without it each call starts an episode:

@@ -190,7 +190,7 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     surface = ax.imshow(scape.utilities, cmap="Greys_r", origin="lower", extent=square, interpolation="bicubic")
     ax.figure.colorbar(surface, ax=ax, label="U(θ), mean return of an episode")
     for index, (name, steps) in enumerate(scape.steps.items()):
-        # Each estimator has a length of its own, so that no fan hides another
+        # The lengths differ by estimator, so that no fan hides another
         x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
         colour = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
         arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)

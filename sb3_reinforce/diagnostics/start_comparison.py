@@ -91,7 +91,7 @@ def sample_starts(model: REINFORCE, n_starts: int) -> list[Rollout]:
     rollouts = []
     firsts = []
     with undisturbed(model):
-        # Pending seeds would replace those of the first episodes
+        # Pending seeds would replace the seeds of the first episodes
         env.reset()
         for part in seeds.reshape(-1, env.num_envs):
             firsts.append(start_from(collector, part))

@@ -90,7 +90,7 @@ class Running:
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
     def unless(self, starts: Bools) -> "Running":
-        """The episodes that go on where none ``starts``; those of further environments are left out."""
+        """The episodes that go on where none ``starts``, without the episodes of further environments."""
         n_envs = len(starts)
         if starts.all():
             return Running.none(n_envs)

@@ -88,10 +88,15 @@ def test_dicts_are_compared_key_by_key():
             self.observation_space = spaces.Dict({"a": env.observation_space, "b": env.observation_space})
 
         def observation(self, obs):
-            return {"a": obs, "b": 1 - np.abs(obs)}
+            return {"a": 0 * obs, "b": obs}
 
-    env = DummyVecEnv([lambda: Dicts(Scales())] * 4)
-    REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2).learn(8)
+    def model_of(**kwargs):
+        env = DummyVecEnv([lambda: Dicts(Scales(**kwargs))] * 4)
+        return REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2)
+
+    assert model_of().learn(8).num_timesteps == 8
+    with pytest.raises(ValueError, match="cannot share their start"):
+        model_of(ignores_seed=True).learn(8)
 
 
 def test_what_cannot_share_its_start_is_refused():

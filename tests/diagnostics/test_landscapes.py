@@ -151,3 +151,9 @@ def test_curves_of_a_single_run_are_refused():
     for wrong in (np.ones((1, 8)), np.ones((3, 7)), np.ones(8)):
         with pytest.raises(ValueError, match=r"runs\['a'\]"):
             plots.plot_learning_curves({"a": wrong}, np.arange(8))
+
+
+def test_afterwards_the_environments_are_independent():
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    landscape(REINFORCE("MlpPolicy", env, device="cpu"), n_points=2, n_episodes=1)
+    assert len(np.unique(env.reset(), axis=0)) == 4
