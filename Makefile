@@ -1,4 +1,4 @@
-.PHONY: format lint type test check
+.PHONY: format lint type test check docs examples agents wheel test-lowest
 
 format:
 	ruff check --select I --fix .
@@ -15,3 +15,28 @@ test:
 	python -m pytest
 
 check: lint type test
+
+# Executes the lesson's pages whose code has changed; SPHINXOPTS="-D nb_execution_mode=off" executes none
+docs:
+	python -m sphinx -W --keep-going -q -d docs/_build/doctrees $(SPHINXOPTS) docs docs/_build/html
+	python docs/_ext/check_html.py docs/_build/html
+	python -m sphinx -W --keep-going -q -d docs/_build/doctrees $(SPHINXOPTS) -b doctest docs docs/_build/doctest
+
+# Two at a time; each asserts the numbers that it states
+examples:
+	ls examples/*.py | xargs -t -n 1 -P 2 env MPLBACKEND=agg python
+
+# Agents for five tasks: python -m sb3_reinforce.zoo enjoy --algo reinforce --env Pendulum-v1 -f agents
+TASKS = MountainCar-v0:400000 Pendulum-v1:200000 Acrobot-v1:100000 MountainCarContinuous-v0:50000 CartPole-v1:50000
+agents:
+	printf '%s\n' $(TASKS) | xargs -P 2 -I {} env OMP_NUM_THREADS=1 sh -c 'task={}; \
+	python -m sb3_reinforce.zoo train --algo reinforce --env $${task%:*} -n $${task#*:} -f agents --eval-freq -1 --seed 0'
+
+wheel:
+	.ci/wheel
+
+# The oldest versions that pyproject.toml allows; matplotlib 3.8 warns of what pyparsing has deprecated since
+test-lowest:
+	uv venv --clear build/lowest
+	uv pip install --python build/lowest --resolution lowest-direct -e ".[tests]"
+	build/lowest/bin/python -m pytest -o filterwarnings=default

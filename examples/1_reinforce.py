@@ -1,14 +1,19 @@
-"""
-Can the plain policy gradient balance a pole?
+# %% [markdown]
+# # Can REINFORCE balance a pole?
+#
+# A pole stands on a cart. Each step at which it has not fallen earns 1, and an episode ends after 500 steps. A policy
+# with parameters $\theta$ draws the actions. Its utility $U(\theta) = E[\text{return}]$ has no formula: we only see
+# samples of it, one per episode.
+#
+# REINFORCE (Williams, 1992) estimates the gradient of $U$ from $N$ episodes of the present policy,
+#
+# $$\hat g = \frac{1}{N} \sum_{i=1}^{N} \sum_t \nabla_\theta \log \pi_\theta(a_t \mid s_t) \, (G_t - b_t),$$
+#
+# and takes one step along it. $G_t$ is the reward from step $t$ on and $b_t$ a baseline: here the mean of $G_t$ over
+# the other episodes. The physics of the cart is not in the formula. It does not depend on $\theta$, so they drop out of
+# $\nabla_\theta \log p_\theta(\text{episode})$.
 
-One gradient step per rollout, no clipping of ratios, no replay: REINFORCE with a critic as its baseline. Training stops
-once 20 episodes in a row of the best actions score 490 on average; then 100 more are scored.
-
-    python examples/1_reinforce.py --seed 0
-"""
-
-import argparse
-
+# %%
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_util import make_vec_env
@@ -16,25 +21,40 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_reinforce import REINFORCE
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--seed", type=int, default=0)
-parser.add_argument("--timesteps", type=int, default=150_000)
-arguments = parser.parse_args()
+seed = 0
 th.set_num_threads(1)
 
-env = make_vec_env("CartPole-v1", n_envs=8, seed=arguments.seed)
-model = REINFORCE("MlpPolicy", env, gae_lambda=0.95, seed=arguments.seed, device="cpu")
+# %% [markdown]
+# Whole episodes, no critic, one policy step per 16 episodes. The policy is Stable-Baselines3's `MlpPolicy`, and its
+# optimizer Adam. Replace `REINFORCE` by `PPO`, without the two arguments `baseline` and `n_episodes`, and the rest of
+# this page stays as it is.
 
+# %%
+env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
+model = REINFORCE(
+    "MlpPolicy", env, baseline="leave_one_out", n_episodes=16, learning_rate=0.01, seed=seed, device="cpu"
+)
+
+# %% [markdown]
+# Training may take 200,000 steps, but it stops as soon as 20 episodes of the most likely actions score 490 on average.
+
+# %%
 until_solved = EvalCallback(
-    make_vec_env("CartPole-v1", n_envs=5, seed=1000 + arguments.seed),
+    make_vec_env("CartPole-v1", n_envs=20, seed=1000 + seed),
     callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=490),
     n_eval_episodes=20,
     eval_freq=500,
     verbose=0,
 )
-model.learn(arguments.timesteps, callback=until_solved, progress_bar=True)
+model.learn(200_000, callback=until_solved, progress_bar=True)
+if model.num_timesteps < 200_000:
+    print(f"Stopped after {model.num_timesteps:,} of 200,000 steps because the task is solved:")
+print(f"20 episodes scored {until_solved.best_mean_reward:.1f} on average.")
 
-mean, std = evaluate_policy(
-    model, make_vec_env("CartPole-v1", n_envs=5, seed=2000 + arguments.seed), n_eval_episodes=100
-)
-print(f"Mean return of 100 episodes after {model.num_timesteps} steps: {mean:.1f} +- {std:.1f}")
+# %% [markdown]
+# One evaluation that was good enough to stop may have been lucky. So 100 more episodes are played.
+
+# %%
+mean, std = evaluate_policy(model, make_vec_env("CartPole-v1", n_envs=50, seed=2000 + seed), n_eval_episodes=100)
+print(f"Mean return of 100 more episodes: {mean:.1f} ± {std:.1f}")
+assert mean > 400, mean

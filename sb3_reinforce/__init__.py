@@ -1,5 +1,6 @@
 """REINFORCE and finite-difference policy search as algorithms of Stable-Baselines3."""
 
+from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 from sb3_reinforce.estimation import Rollout
 from sb3_reinforce.finite_difference import FiniteDifference
@@ -18,4 +19,5 @@ __all__ = [
     "MaskedPolicy",
     "Rollout",
     "__version__",
+    "is_leader",
 ]

@@ -16,7 +16,9 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
+from sb3_reinforce.common.base import BasePolicyGradient
+from sb3_reinforce.common.distribution import together
+from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
@@ -199,6 +201,7 @@ class FiniteDifference(BasePolicyGradient):
         return self._searched
 
     @guarded
+    @together
     def learn(
         self: SelfFiniteDifference,
         total_timesteps: int,
@@ -220,6 +223,7 @@ class FiniteDifference(BasePolicyGradient):
         :return: The trained model
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
+        :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         total_timesteps, callback = self._setup_learn(
@@ -230,7 +234,7 @@ class FiniteDifference(BasePolicyGradient):
             warnings.warn(
                 f"n_delta={self.n_delta} perturbations do not determine the gradient of {n} parameters and an "
                 "intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
-                stacklevel=3,
+                stacklevel=4,
             )
         callback.on_training_start(locals(), globals())
         iteration = 0
@@ -257,6 +261,7 @@ class FiniteDifference(BasePolicyGradient):
         :raises ValueError: As ``learn``
         """
         callback.on_rollout_start()
+        self.start_round()
         self.is_collecting = True
         try:
             searched = self._find_parameters()
@@ -280,9 +285,15 @@ class FiniteDifference(BasePolicyGradient):
             self.is_collecting = False
             # The environments are in the middle of episodes, and are reset before they are used again
             self._last_obs = None
+        if self._processes is not None:
+            self.end_round(None)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return GradientEstimate(gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched)
+
+    def collect_part(self, callback: BaseCallback) -> None:
+        # The utility evaluates this process's part of the perturbations, which all processes draw alike
+        self.estimate_gradient(callback)
 
     @uninterrupted
     def train(self, estimate: GradientEstimate) -> None:

@@ -13,12 +13,12 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
-from sb3_reinforce.estimation import Rollout
 from sb3_reinforce.policies.evaluation import Route
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.collection import Bools, TerminalObs
+from sb3_reinforce.sampling.collection import Bools
+from sb3_reinforce.sampling.columns import Columns
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
 __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
@@ -42,7 +42,7 @@ class RecurrentREINFORCE(REINFORCE):
     cut comes from one more step of its sequence. The critic's minibatches are whole sequences of about ``batch_size``
     steps.
 
-    ``policy_kwargs`` are those of sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
+    ``policy_kwargs`` as in sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
     ``shared_lstm``, ``lstm_kwargs``; ``memory`` is ``"lstm"``, ``"gru"`` or ``"rnn"``.
 
     To predict, hand the state on; without it each call starts an episode:
@@ -79,7 +79,7 @@ class RecurrentREINFORCE(REINFORCE):
         batch_size: int = 4096,
         **kwargs: Any,
     ):
-        if n_steps is None and n_episodes is None:
+        if n_steps is None and n_episodes is None and kwargs.get("episodes_per_start", 1) == 1:
             n_episodes = 16
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
@@ -145,7 +145,7 @@ class RecurrentREINFORCE(REINFORCE):
             starts = th.as_tensor(self._episode_starts(), device=self.device)
             self._state = None
             if self._next_state is not None and not starts.all():
-                self._state = self._next_state * ~starts[(...,) + (None,) * 4]
+                self._state = self._next_state[: self.n_envs] * ~starts[(...,) + (None,) * 4]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
         self._actor = make_recurrent_actor(policy, state, self._episode_starts, keep_outputs)
         return self._actor
@@ -155,28 +155,28 @@ class RecurrentREINFORCE(REINFORCE):
         return np.asarray(self._last_episode_starts, dtype=bool)
 
     def _state_after_rollout(self) -> th.Tensor:
-        """The states at the cut; the critic's is computed from the rollout, since only the actor acts."""
+        """The states at the cut; the critic's are computed from the rollout, in process 0 for the columns of all."""
         policy = cast(RecurrentPolicy, self.policy)
-        rollout = cast(Rollout, self.rollout)
-        state = policy.zero_state(self.n_envs)
-        state[:, 0] = cast(RecurrentActor, self._actor).state()
-        if rollout.values is not None and policy.lstm_critic is not None:
+        rollout = self.rollout
+        state = policy.zero_state(self.n_envs if rollout is None else rollout.dones.shape[1])
+        state[: self.n_envs, 0] = cast(RecurrentActor, self._actor).state()
+        if rollout is not None and rollout.values is not None and policy.lstm_critic is not None:
             state[:, 1] = policy.state_after(select(rollout.inputs, rollout.episodes == rollout.episodes[-1]))
         return state
 
     @th.no_grad()
-    def _evaluate_critic(
-        self, route: Route, buffer: RolloutBuffer, dones: Bools, terminal_obs: TerminalObs
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
         policy = cast(RecurrentPolicy, self.policy)
-        rows = rows_of(
-            obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), self._state
-        )
+        dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
+        if state is not None and self._next_state is not None:
+            goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
+            state[:, 1] = self._next_state[: len(state), 1] * goes_on[(...,) + (None,) * 3]
+        rows = rows_of(obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), state)
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T
         following = take(rows, (steps, envs))
-        observed = [self._last_obs, *(stack([obs]) for obs in terminal_obs.values())]
+        observed = [columns.last_obs, *(stack([obs]) for obs in terminal_obs.values())]
         following["observations"] = concatenate(*(shaped_like(following["observations"], obs) for obs in observed))
         # An episode that has ended with the rollout does not go on in the next observation, whose V is not asked for
         following["sequence"][:n_envs][th.as_tensor(dones[-1])] = -1

@@ -23,8 +23,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.base import BasePolicyGradient, uninterrupted
-from sb3_reinforce.common.settings import INSTEAD_OF_PPO, REINFORCE_ARGUMENTS, check_learn, check_reinforce
+from sb3_reinforce.common.base import BasePolicyGradient
+from sb3_reinforce.common.distribution import together
+from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.settings import (
+    INSTEAD_OF_PPO,
+    REINFORCE_ARGUMENTS,
+    check_learn,
+    check_reinforce,
+    check_starts,
+)
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
@@ -43,15 +51,8 @@ from sb3_reinforce.policies.evaluation import (
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
-from sb3_reinforce.sampling.collection import (
-    Bools,
-    Extent,
-    TerminalObs,
-    by_step,
-    check_rollout_data,
-    collect,
-    warn_of_own_methods,
-)
+from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
+from sb3_reinforce.sampling.columns import Columns, gather
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -83,7 +84,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
-        32 steps for ``baseline="value"``, 16 episodes for the others
+        32 steps for ``baseline="value"``, 16 episodes for the others (with ``episodes_per_start``, one of each
+        environment)
     :param gamma: Discount factor
     :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
         ``baseline="value"`` and ``reward_to_go=True``
@@ -98,8 +100,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         contributes a number of episodes fixed beforehand; steps beyond them are made and counted, but not used
     :param episodes_per_start: m > 1 lets the episodes of m neighbouring environments start from the same seed, and
         ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
-        more than about half of the variance of the return lies between starts, which ``diagnostics.compare_starts``
-        measures. A rollout is then one episode of each environment
+        much of the variance of the return lies between starts: ask ``diagnostics.compare_starts``. A rollout is then
+        one episode of each environment
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
@@ -227,8 +229,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         #: Whether a rollout is being collected, so that its environments must be left alone
         self.is_collecting = False
         self._state: th.Tensor | None = None
+        self._running = Running.none(1)
         if _init_setup_model:
             self._setup_model()
+            check_starts(self)
 
     @property
     def has_critic(self) -> bool:
@@ -298,25 +302,30 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
+        # The last rollout may have the columns of several processes
+        rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
+        check_starts(self)
+        self.start_round()
         if self.episodes_per_start > 1:
+            self._last_obs = None
             self._last_obs = start_groups(env, self.episodes_per_start)
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         # A measurement that failed in a callback leaves no observation
         elif self._last_obs is None or (n_rollout_steps is None and not np.all(self._last_episode_starts)):
             self._last_obs = env.reset()  # type: ignore[assignment]
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-        if np.all(self._last_episode_starts):
-            self._running = Running.none(env.num_envs)
         if n_rollout_steps is None:
-            extent = Extent.whole_episodes(cast(int, self.n_episodes), env.num_envs, self.max_episode_steps)
+            n_episodes = self.share_of(cast(int, self.n_episodes))
+            extent = Extent.whole_episodes(n_episodes, env.num_envs, self.max_episode_steps)
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
         route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
+        is_collected = False
         self.is_collecting = True
         try:
             collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
@@ -324,17 +333,24 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
                 return False
             dones, terminal_obs, route = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
+            own = Columns(dones, terminal_obs, self._last_obs, extent.quota, self._state)
+            columns = gather(self, rollout_buffer, own)
+            if columns is None:
+                is_collected = True
+                return True
+            dones = columns.dones
+            self._running = self._running.unless(rollout_buffer.episode_starts[0].astype(bool))
             next_values = None
             if route.with_critic:
-                rollout_buffer.values, next_values = self._evaluate_critic(route, rollout_buffer, dones, terminal_obs)
+                rollout_buffer.values, next_values = self._evaluate_critic(route, rollout_buffer, columns)
             self.rollout = complete_rollout(
                 rollout_buffer,
                 self.policy,
                 dones,
-                None if n_rollout_steps else extent.quota,
+                None if n_rollout_steps else columns.quota,
                 self._running,
                 next_values,
-                self._state,
+                columns.state,
                 baseline=self._function("baseline", BASELINES),
                 gamma=self.gamma,
                 gae_lambda=self.gae_lambda,
@@ -343,13 +359,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
                 normalize_by=self.normalize_by,
                 episodes_per_start=self.episodes_per_start,
             )
+            is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
             check_rollout_data(rollout_buffer, self._last_obs, {})
             raise
         finally:
             self.is_collecting = False
-            if self.rollout is None:
+            if not is_collected:
                 # The environments stopped in the middle of episodes, and are reset before they are used again
                 self._last_obs = None
         self._running = self._running.after(rollout_buffer.rewards, dones, self.gamma)
@@ -360,15 +377,16 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    def collect_part(self, callback: BaseCallback) -> None:
+        self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
+
     def _make_actor(self, route: Route, keep_outputs: bool) -> Actor:
         return make_actor(self.policy, route, self.n_envs, keep_outputs)
 
-    def _evaluate_critic(
-        self, route: Route, buffer: RolloutBuffer, dones: Bools, terminal_obs: TerminalObs
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""
         values = values_along(self.policy, route, buffer)
-        return values, values_after(self.policy, route, values, dones, self._last_obs, terminal_obs)
+        return values, values_after(self.policy, route, values, columns.dones, columns.last_obs, columns.terminal_obs)
 
     @uninterrupted
     def train(self) -> None:
@@ -468,6 +486,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         model.n_episodes = n_episodes
         model.episodes_per_start = 1
         model.baseline = baseline or ("value" if self.has_critic else "none")
+        model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)
         model.ep_success_buffer = deque(maxlen=1)
@@ -478,6 +497,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return model
 
     @guarded
+    @together
     def learn(
         self: SelfREINFORCE,
         total_timesteps: int,
@@ -497,7 +517,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param reset_num_timesteps: Whether to reset the count of steps and the environments
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
-        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, or processes under
+            torchrun have different arguments
+        :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

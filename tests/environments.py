@@ -60,7 +60,7 @@ class Scales(gym.Env[np.ndarray, np.int64]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=None if self.ignores_seed else seed)
         self.x = 2 * int(self.np_random.integers(2)) - 1
-        return np.full(1, self.x if self.ignores_seed else 1.0, dtype=np.float32), {}
+        return np.full(1, self.np_random.random() if self.ignores_seed else 1.0, dtype=np.float32), {}
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
         reward = self.scale * self.x + (2 * int(action) - 1) * self.effect

@@ -3,11 +3,13 @@ How much of a gradient's variance is the luck of the start?
 
     python examples/benchmarks/common_random_numbers.py --env Pendulum-v1
 
-Estimates the gradient at one θ many times, with and without common random numbers, and prints the ratio of the
-variances (traces of the covariances) at the same number of episodes, and that of the steps they took.
+Estimates the gradient at one θ many times, with and without common random numbers. Prints, as CSV, the ratio of the
+variances (traces of the covariances) at the same number of episodes, and the ratio of the steps they took.
 """
 
 import argparse
+import csv
+import sys
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -39,9 +41,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     th.set_num_threads(1)
-    print(
-        f"{arguments.env}, {arguments.policy}, {arguments.n_gradients} gradients of {arguments.n_delta} perturbations"
-    )
+    writer = csv.writer(sys.stdout)
+    writer.writerow(["env", "policy", "n_gradients", "n_delta", "estimator", "variance_ratio", "steps_ratio"])
     for estimator in ("central", "forward", "regression"):
         variances, steps = {}, {}
         for common in (True, False):
@@ -54,10 +55,9 @@ def main() -> None:
             model.learn(10**9, callback, log_interval=None)
             variances[common] = float(th.stack(callback.gradients).var(0).sum())
             steps[common] = model.num_timesteps
-        print(
-            f"  {estimator:10s} variance without / with {variances[False] / variances[True]:7.2f}"
-            f"   steps with / without {steps[True] / steps[False]:5.2f}"
-        )
+        measured = [arguments.env, arguments.policy, arguments.n_gradients, arguments.n_delta, estimator]
+        ratios = [variances[False] / variances[True], steps[True] / steps[False]]
+        writer.writerow([*measured, *(f"{ratio:.2f}" for ratio in ratios)])
 
 
 if __name__ == "__main__":

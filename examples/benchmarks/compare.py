@@ -11,6 +11,9 @@ The CSV has a row per evaluation: on 10 deterministic episodes at the start of t
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
 ``cpu_seconds`` the same by the process's own clock, which a busy machine does not stretch. The rows of a run are
 written when it is finished, and a run that is there is not repeated: stop the script when you like and start it again.
+
+Under ``python -m torch.distributed.run --standalone --nproc-per-node W`` our runs collect in W processes, one run after
+the other, and process 0 trains the peers. The first error ends them all.
 """
 
 import argparse
@@ -38,6 +41,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_reinforce import is_leader
+from sb3_reinforce.common.processes import Processes, place
 from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
@@ -75,7 +80,7 @@ def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
 
 
 def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
-    """A model, its environments and those of its evaluations, with a configuration that no other run shares."""
+    """A model, its environments and evaluation environments, with a configuration that no other run shares."""
     with contextlib.redirect_stdout(io.StringIO()):
         manager = (Experiment if run.algorithm in OURS else ExperimentManager)(
             argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
@@ -84,14 +89,14 @@ def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
         settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
         kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
         env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
-        # The same starts for all algorithms, other than those of the training
+        # The same starts for all algorithms, other than in training
         manager.seed = 10_000 + run.seed
         eval_env = manager.create_envs(EVALUATION_EPISODES, eval_env=True)
     return rl_zoo3.ALGOS[run.algorithm](env=env, seed=run.seed, device="cpu", **kwargs), env, eval_env
 
 
 def clocks() -> np.ndarray:
-    """The time of the day and that of this process, in seconds."""
+    """The time of the day and the time of this process, in seconds."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
@@ -103,7 +108,8 @@ class Evaluations(BaseCallback):
         self.run, self.env, self.eval_env = run, env, eval_env
         self.rows: list[dict[str, Any]] = []
         self.twentieth = 0
-        self.spent, self.since = np.zeros(2), clocks()
+        self.spent = np.zeros(2)
+        self.since = clocks()
 
     def _on_step(self) -> bool:
         return True
@@ -143,7 +149,8 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
         model, env, eval_env = make(run)
         evaluations = Evaluations(run, env, eval_env)
         model.learn(run.budget, evaluations, log_interval=None)
-        evaluations.evaluate("final", final_episodes)
+        if is_leader():
+            evaluations.evaluate("final", final_episodes)
     except Exception as error:
         return run, error
     return run, evaluations.rows
@@ -151,6 +158,8 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
 
 def finished(path: Path) -> set[tuple[Any, ...]]:
     """The runs that a CSV has the last row of."""
+    if not path.exists():
+        return set()
     rows = pd.read_csv(path)
     return set(rows.loc[rows["evaluation"] == "final", list(Run._fields)].itertuples(index=False, name=None))
 
@@ -170,25 +179,41 @@ def main() -> None:
     # As Ctrl-C, which ends the pool's processes too
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    if not arguments.output.exists():
+    if is_leader() and not arguments.output.exists():
         arguments.output.write_text(",".join(COLUMNS) + "\n")
     wanted = [
         Run(task, algorithm, seed, arguments.timesteps or BUDGETS.get(task, OTHER_BUDGET))
         for seed, task, algorithm in itertools.product(arguments.seeds, arguments.tasks, arguments.algorithms)
         if settings_of(algorithm, task)
     ]
-    runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index)
+    runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index) if is_leader() else []
+    is_alone = place() == (0, 1)
+    if not is_alone:
+        with Processes() as processes:
+            runs = processes.exchange(runs)[0]
     if not runs:
         raise SystemExit(f"Nothing to do: {arguments.output} has the {len(wanted)} runs that there are settings for")
-    failed, start = [], time.perf_counter()
-    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        results = pool.imap_unordered(functools.partial(train, arguments.final_episodes), runs)
+    failed = []
+    start = time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        map_runs: Any = map
+        if is_alone:
+            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes))
+            map_runs = pool.imap_unordered
+        elif not is_leader():
+            runs = [run for run in runs if run.algorithm in OURS]
+        results = map_runs(functools.partial(train, arguments.final_episodes), runs)
         for number, (run, outcome) in enumerate(results, 1):
             minutes = (time.perf_counter() - start) / 60
             left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"
             if isinstance(outcome, Exception):
+                if not is_alone:
+                    # The other processes may be in another run
+                    raise outcome
                 result = repr(outcome)
                 failed.append(f"{run}: {result}")
+            elif not is_leader():
+                continue
             else:
                 pd.DataFrame(outcome).to_csv(arguments.output, mode="a", header=False, index=False)
                 result = "{return:.1f}, {steps} steps, {seconds:.0f} s".format(**outcome[-1])

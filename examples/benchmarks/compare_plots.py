@@ -3,7 +3,7 @@ What a comparison shows: tables, and pictures by rliable (intervals are 95 % of 
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 
-Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds, a row per task) and
+Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds) and
 results_summary.png (interquartile mean, performance profiles and probability of improvement over all tasks), and prints
 the final evaluations as a Markdown table. In the summary 0 is a random policy and 1 the Zoo's published PPO; it has the
 algorithms that were run on every task.
@@ -19,6 +19,8 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from rliable import library, metrics
 from scipy.stats import trim_mean
+
+from sb3_reinforce.diagnostics.plots import COLOURS
 
 REPETITIONS = 2000
 LABELS = {
@@ -61,23 +63,35 @@ def iqm_of_points(scores: np.ndarray) -> np.ndarray:
 
 def draw_curves(results: pd.DataFrame, clock: str) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
-    figure, rows = plt.subplots(len(tasks), 2, figsize=(9, 2.6 * len(tasks)), layout="constrained", squeeze=False)
-    for axes, ((task, budget), runs) in zip(rows, tasks, strict=True):
+    n_rows = (len(tasks) + 1) // 2
+    figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
+    pairs = grid.reshape(-1, 2)
+    for axes, ((task, budget), runs) in zip(pairs, tasks, strict=False):
         for algorithm, mine in runs.groupby("algorithm", sort=False):
             seconds = mine[mine["evaluation"] == "final"][clock].median()
             for axis, column, end in zip(axes, ("steps", clock), (budget, seconds), strict=True):
                 points, iqm, (low, high) = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
-        axes[0].set(title=task, xlabel="steps", ylabel="return")
+        axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
         axes[1].set(title=task, xlabel="seconds of training", xscale="symlog")
+    for axis in pairs[len(tasks) :].flat:
+        axis.set_axis_off()
     # An algorithm need not have been run on the first task
-    lines = {line.get_label(): line for axis in rows[:, 0] for line in axis.get_lines()}
-    figure.legend(handles=list(lines.values()), loc="outside upper center", ncols=len(lines), frameon=False)
+    lines = {line.get_label(): line for axis in pairs[:, 0] for line in axis.get_lines()}
+    legend = {"loc": "outside upper center", "ncols": len(lines), "frameon": False}
+    title = f"interquartile mean of {seeds_of(results)}, bands: 95 % bootstrap intervals"
+    figure.legend(handles=list(lines.values()), title=title, **legend)
+
+
+def seeds_of(results: pd.DataFrame) -> str:
+    """How many seeds the runs of a task and an algorithm have."""
+    counts = results.groupby(["task", "algorithm"])["seed"].nunique()
+    return f"{counts.min()} seeds" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()} seeds"
 
 
 def color(algorithm: str) -> str:
-    return f"C{list(LABELS).index(algorithm)}" if algorithm in LABELS else "black"
+    return COLOURS[list(LABELS).index(algorithm)] if algorithm in LABELS else "black"
 
 
 def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -97,16 +111,18 @@ def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def draw_summary(scores: dict[str, np.ndarray]) -> None:
-    _, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    n_runs, n_tasks = next(iter(scores.values())).shape
+    figure.suptitle(f"{n_tasks} tasks, {n_runs} seeds; bars and bands are 95 % bootstrap intervals", fontsize="medium")
     means, intervals = library.get_interval_estimates(scores, metrics.aggregate_iqm, reps=REPETITIONS)
     draw_intervals(left, means, intervals)
-    left.set(xlabel="normalized return, interquartile mean")
+    left.set(title="All tasks together", xlabel="interquartile mean of the return\n(0: random, 1: published PPO)")
     thresholds = np.linspace(0, 1.2, 61)
     profiles, bands = library.create_performance_profile(scores, thresholds, reps=REPETITIONS)
     for name, profile in profiles.items():
         middle.plot(thresholds, profile, color=color(name), label=LABELS.get(name, name))
         middle.fill_between(thresholds, *bands[name], color=color(name), alpha=0.2, linewidth=0)
-    middle.set(xlabel="normalized return τ", ylabel="share of runs above τ")
+    middle.set(title="Performance profiles", xlabel="normalized return τ", ylabel="share of runs above τ")
     middle.legend(frameon=False, fontsize="small")
     others = {name: (scores.get("reinforce"), score) for name, score in scores.items() if name != "reinforce"}
     if "reinforce" not in scores or not others:
@@ -116,7 +132,7 @@ def draw_summary(scores: dict[str, np.ndarray]) -> None:
     chances, spans = library.get_interval_estimates(others, metrics.probability_of_improvement, reps=REPETITIONS)
     draw_intervals(right, chances, spans)
     right.axvline(0.5, color="grey", linestyle=":")
-    right.set(xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
+    right.set(title="Probability of improvement", xlabel="probability that REINFORCE ends higher", xlim=(0, 1))
 
 
 def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[str, np.ndarray]) -> None:

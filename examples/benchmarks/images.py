@@ -8,7 +8,9 @@ images, so the networks and the way of the observations to them are what is meas
 """
 
 import argparse
+import csv
 import statistics
+import sys
 import warnings
 from typing import Any
 
@@ -48,6 +50,8 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
+    writer = csv.writer(sys.stdout)
+    writer.writerow(["n_envs", "device", "REINFORCE / A2C"])
     for n_envs in arguments.n_envs:
         both = {"n_steps": 32, "device": arguments.device}
         ours = {**both, "n_critic_updates": 1, "batch_size": 32 * n_envs}
@@ -58,9 +62,8 @@ def main() -> None:
                 for algorithm, kwargs in ((REINFORCE, ours), (A2C, both))
             ]
             ratios.append(rates[0] / rates[1])
-        print(
-            f"{n_envs} environments on {arguments.device}: REINFORCE / A2C {statistics.median(ratios):.2f}", flush=True
-        )
+        writer.writerow([n_envs, arguments.device, f"{statistics.median(ratios):.2f}"])
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """
-How does throughput grow with the number of environments, and how far is it from that of the environments alone?
+How does throughput grow with the number of environments, and how far is it from the environments alone?
 
 CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorisation
 through ``GymnasiumVecEnv``, and the ``step`` of both VecEnvs with no learner. Writes a CSV, and with matplotlib the
@@ -42,9 +42,9 @@ def a2c(env: VecEnv, timesteps: int) -> float:
 
 
 CONTENDERS: dict[str, Callable[[int, int], float]] = {
-    "native VecEnv, no learner": lambda n, steps: bare(native(n), steps),
+    "GymnasiumVecEnv, no learner": lambda n, steps: bare(native(n), steps),
     "DummyVecEnv, no learner": lambda n, steps: bare(dummy(n), steps),
-    "REINFORCE, native": lambda n, steps: reinforce(native(n), steps),
+    "REINFORCE, GymnasiumVecEnv": lambda n, steps: reinforce(native(n), steps),
     "REINFORCE": lambda n, steps: reinforce(dummy(n), steps),
     "A2C": lambda n, steps: a2c(dummy(n), steps),
 }
@@ -56,11 +56,18 @@ def draw(rows: list[dict[str, object]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    from sb3_reinforce.diagnostics.plots import COLOURS
+
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    for name, style in zip(CONTENDERS, ("C0:", "C1:", "C0-o", "C1-o", "C2-o"), strict=True):
+    colours = (COLOURS[0], COLOURS[1], COLOURS[0], COLOURS[1], COLOURS[2])
+    for name, style, colour in zip(CONTENDERS, (":", ":", "-o", "-o", "-s"), colours, strict=True):
         points = [(row["n_envs"], row["steps_per_second"]) for row in rows if row["contender"] == name]
-        axes.loglog(*zip(*points, strict=True), style, label=name, markersize=4)
-    axes.set(xlabel="copies of CartPole-v1", ylabel="steps a second, one core")
+        axes.loglog(*zip(*points, strict=True), style, color=colour, label=name, markersize=4)
+    axes.set(
+        title="Speed by number of environments (medians)",
+        xlabel="copies of CartPole-v1",
+        ylabel="steps a second, one core",
+    )
     axes.set_xscale("log", base=2)
     axes.legend(frameon=False, fontsize="small")
     axes.grid(alpha=0.3)

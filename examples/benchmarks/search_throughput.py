@@ -3,13 +3,15 @@ How many gradients a second does FiniteDifference estimate, beside SB3-Contrib's
 
 Both evaluate the same number of candidates, an episode each, on the same VecEnv with one thread; the learning rate is
 0, so that the policies, and with them the lengths of the episodes, stay as they are. The two take turns in each round;
-the ratios of the rounds and their median are printed.
+the median, least and greatest ratio of the rounds are printed, as CSV.
 
     python examples/benchmarks/search_throughput.py --env Pendulum-v1 --policy LinearPolicy
 """
 
 import argparse
+import csv
 import statistics
+import sys
 import time
 import warnings
 
@@ -46,8 +48,10 @@ def main() -> None:
     for _ in range(arguments.rounds):
         ours = gradients_per_second(FiniteDifference, arguments, estimator="central")
         ratios.append(ours / gradients_per_second(ARS, arguments, zero_policy=False))
-    rounds = ", ".join(f"{ratio:.1f}" for ratio in ratios)
-    print(f"{arguments.env}, {arguments.policy}: {statistics.median(ratios):.1f} times ARS (rounds: {rounds})")
+    writer = csv.writer(sys.stdout)
+    writer.writerow(["env", "policy", "rounds", "median", "least", "greatest"])
+    figures = (statistics.median(ratios), min(ratios), max(ratios))
+    writer.writerow([arguments.env, arguments.policy, arguments.rounds, *(f"{figure:.1f}" for figure in figures)])
 
 
 if __name__ == "__main__":

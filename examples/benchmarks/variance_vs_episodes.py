@@ -61,6 +61,7 @@ with open(arguments.output / "variance_vs_episodes.csv", "w", newline="") as fil
             writer.writerows([name, size, group, f"{variance:.6g}"] for size, variance in zip(SIZES, row, strict=True))
 for index, name in enumerate(BASELINES):
     print(f"{name:14s}", *(f"{variance:10.1f}" for variance in variances[:, :, index].mean(0)))
-ax = plot_variances({name: variances[:, :, index] for index, name in enumerate(BASELINES)}, SIZES)
-ax.set_title(f"CartPole-v1 after {model.num_timesteps:,} steps of training")
+labels = [f"{name} (biased)" if name in ("mean", "time_mean") else name for name in BASELINES]
+ax = plot_variances({label: variances[:, :, index] for index, label in enumerate(labels)}, SIZES)
+ax.set_title(f"Gradients on CartPole-v1 after {model.num_timesteps:,} steps of training, {N_GROUPS} repetitions")
 ax.figure.savefig(arguments.output / "variance_vs_episodes.png", dpi=150)

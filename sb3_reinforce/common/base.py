@@ -9,17 +9,15 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common import storage
 from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
-from sb3_reinforce.common.interruptions import uninterrupted
+from sb3_reinforce.common.distribution import Distributed
+from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, shift_to_start
-
-__all__ = ["BasePolicyGradient", "uninterrupted"]
 
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
@@ -29,7 +27,7 @@ LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
 
-class BasePolicyGradient(BaseAlgorithm):
+class BasePolicyGradient(Distributed):
     """What both algorithms have in common besides the mathematics: saving and loading change everything or nothing."""
 
     # The checks of the constructor's arguments, which also build the schedules
@@ -48,6 +46,7 @@ class BasePolicyGradient(BaseAlgorithm):
         return super().__new__(cls)
 
     def __init__(self, policy: Any, env: Any, *, needs_env: bool, policy_kwargs: Any, verbose: int, **kwargs: Any):
+        verbose = verbose if is_leader() else 0
         kwargs |= {"policy": policy, "policy_kwargs": policy_kwargs, "verbose": verbose}
         # Stable-Baselines3 uses some arguments as soon as it has them
         for name in kwargs.keys() & self._arguments.keys():
@@ -113,7 +112,7 @@ class BasePolicyGradient(BaseAlgorithm):
         """
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
 
-        :param path: The file, to which ``.zip`` is added where it has no suffix
+        :param path: The file, to which ``.zip`` is added where it has no suffix; under torchrun process 0 writes it
         :param exclude: Attributes not to save, besides those that never are
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written

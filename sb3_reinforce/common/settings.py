@@ -26,6 +26,7 @@ from sb3_reinforce.common.arguments import (
     optional,
     unknown_name,
 )
+from sb3_reinforce.common.processes import place
 
 Functions = Mapping[str, Callable[..., Any]]
 
@@ -154,19 +155,13 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     if model.n_steps is None and model.n_episodes is None:
         model.n_steps = 32 if model.has_critic and not shares_starts else None
         if model.n_steps is None:
-            model.n_episodes = model.n_envs if shares_starts else 16
+            model.n_episodes = model.n_envs * place()[1] if shares_starts else 16
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
     if model.n_episodes == 1 and model.baseline in ("leave_one_out", "optimal"):
         reason = f"baseline={model.baseline!r}, which is computed from the other episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
-    if shares_starts and (model.n_episodes != model.n_envs or model.n_envs % model.episodes_per_start):
-        raise ValueError(
-            f"episodes_per_start={model.episodes_per_start} needs a rollout of one episode of each environment, and a "
-            f"multiple of that number of environments: got n_episodes={model.n_episodes} and {model.n_envs} "
-            "environments"
-        )
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
         got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
         raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
@@ -177,6 +172,25 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")
     elif model.min_std > 0:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
+
+
+def check_starts(model: Any) -> None:
+    """Check that the episodes of a rollout can share their starts, as the model and its environments are now."""
+    m = model.episodes_per_start
+    n_episodes = model.n_envs * place()[1]
+    if m == 1:
+        return
+    if model.n_steps is not None or model.n_episodes != n_episodes or model.n_envs % m:
+        raise ValueError(
+            f"episodes_per_start={m} needs one whole episode of each environment, n_episodes={n_episodes}, and a "
+            f"multiple of {m} environments: got n_steps={model.n_steps}, n_episodes={model.n_episodes} and "
+            f"{model.n_envs} environments"
+        )
+    if model.baseline in ("none", "mean", "value"):
+        raise ValueError(
+            f"episodes_per_start={m} needs a baseline that compares the episodes of a start ('time_mean', "
+            f"'leave_one_out', 'optimal' or a function), got baseline={model.baseline!r}"
+        )
 
 
 def check_finite_difference(model: Any, estimators: Functions, perturbations: Functions) -> None:

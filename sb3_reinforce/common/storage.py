@@ -17,6 +17,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.save_util import open_path
 
+from sb3_reinforce.common.processes import is_leader
+
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 
 
@@ -24,6 +26,8 @@ def write_whole(target: PathOrFile, content: bytes) -> None:
     """Write to where Stable-Baselines3 saves; at each moment either the old file or the new one exists."""
     if not isinstance(target, (str, Path)):
         open_path(target, "w").write(content)
+        return
+    if not is_leader():
         return
     path = Path(target)
     path = path if path.suffix else path.with_name(f"{path.name}.zip")

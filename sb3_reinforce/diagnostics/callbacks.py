@@ -56,8 +56,9 @@ class GradientQualityCallback(Diagnosis):
     - ``gradient/variance/<baseline>``: tr Σ of one episode for each of ``baselines``, computed from these episodes;
     - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
 
-    A FiniteDifference has only the cosine, as its episodes have no gradients of their own. It logs the quality of its
-    estimate itself: ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
+    With ``episodes_per_start`` only the cosine is logged, since the episodes of a start are not independent. A
+    FiniteDifference has only the cosine too, as its episodes have no gradients. It logs the quality of its estimate:
+    ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
     rollout and are noisy if it has few episodes; with fewer than two, or while the actor is frozen, nothing is logged.
@@ -127,7 +128,8 @@ class GradientQualityCallback(Diagnosis):
     def measure(self, rollout: Rollout) -> dict[str, float]:
         """The figures of one rollout, before training on it."""
         n_episodes = len(th.unique(rollout.episodes[rollout.used]))
-        if n_episodes < 2:
+        # Episodes that share their start are not independent
+        if n_episodes < 2 or rollout.episodes_per_start > 1:
             return {}
         own_weights = training_weights(cast(REINFORCE, self.model))
         rollout = evenly_spread(rollout, self.max_episodes)

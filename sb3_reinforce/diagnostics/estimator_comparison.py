@@ -9,7 +9,7 @@ from functools import partial
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number, check_unless_none
-from sb3_reinforce.diagnostics.landscapes import CandidateUtility
+from sb3_reinforce.diagnostics.landscapes import CandidateUtility, episode_bar
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
@@ -55,6 +55,7 @@ def compare_estimators(
     n_resamples: int = 500,
     confidence: float = 0.95,
     seed: int = 0,
+    progress_bar: bool = False,
 ) -> Table[EstimatorRow]:
     """
     Estimate the gradient at the model's θ with each family, with the same sampling policy and γ = 1.
@@ -77,6 +78,7 @@ def compare_estimators(
     :param n_resamples: Number of bootstrap resamples
     :param confidence: Probability with which an interval should cover the true value
     :param seed: Seed of perturbations, episodes (also of the environments) and resamples
+    :param progress_bar: Display a bar of tqdm that counts the episodes of the differences
     :return: A table with one ``EstimatorRow`` per estimator
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
@@ -98,7 +100,7 @@ def compare_estimators(
     scale = default_delta_std(utility.theta) if delta_std is None else delta_std
     generator = th.Generator().manual_seed(seed)
     rows = []
-    with seeded(model.policy, seed):
+    with seeded(model.policy, seed), episode_bar(progress_bar) as utility.bar:
         reference = likelihood_ratio(model, n_episodes)[0]
         for name in names:
             begin = time.perf_counter()

@@ -1,9 +1,10 @@
 """The performance landscape: U(θ) on a plane through a policy's parameters, and gradients projected on it."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -41,6 +42,8 @@ class CandidateUtility:
         self.n_episodes = check_integer("n_episodes", n_episodes, 1)
         self.seed = check_integer("seed", seed, 0)
         self.n_steps = 0
+        #: A bar of tqdm that counts episodes, or None
+        self.bar: Any = None
         policy = cast(ActorCriticPolicy, model.policy)
         self.parameters = actor_parameters(policy)
         self.theta = read(self.parameters)
@@ -61,11 +64,24 @@ class CandidateUtility:
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)
             returns = evaluate_candidates(self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
+            # Environments that have shared a start would go on with the same random numbers
+            self.env.seed(self.seed)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
     def _count(self, step: CandidateStep) -> None:
         """Count the steps of all environments, including idle ones."""
         self.n_steps += len(step.dones)
+        if self.bar is not None:
+            self.bar.update(int(np.count_nonzero(step.finished)))
+
+
+def episode_bar(progress_bar: bool, n_episodes: int | None = None) -> AbstractContextManager[Any]:
+    """A progress bar that counts episodes, or None; only the bar needs tqdm."""
+    if not progress_bar:
+        return nullcontext()
+    from tqdm import tqdm
+
+    return cast(AbstractContextManager[Any], tqdm(total=n_episodes, unit=" episodes"))
 
 
 @dataclass(frozen=True)
@@ -76,7 +92,7 @@ class Landscape:
     :param scales: The values of x and of y, shape ``(s,)``
     :param utilities: Shape ``(s, s)``: rows are y, columns are x
     :param steps: By name, the projection (x, y) of each gradient on the plane, scaled to the length of the largest
-        scale
+        scale; shape ``(2,)``, or ``(m, 2)`` for m gradients
     """
 
     scales: np.ndarray
@@ -92,18 +108,21 @@ def landscape(
     n_points: int = 11,
     n_episodes: int = 5,
     seed: int = 0,
+    progress_bar: bool = False,
 ) -> Landscape:
     """
     Evaluate the utility on a plane through θ.
 
     :param model: A model with an actor-critic policy; it is not changed
-    :param gradients: Gradients of the actor's parameters to draw, by name, each of shape ``(n,)``
+    :param gradients: Gradients of the actor's parameters to draw, by name, each of shape ``(n,)``, or ``(m, n)`` for
+        several estimates of one gradient
     :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,
         normalized filter by filter (Li et al., 2018, section 4)
     :param extent: Half the width of the plane, in multiples of the directions
     :param n_points: Points along each side
     :param n_episodes: Episodes per point
     :param seed: Seed of the directions and of the episodes
+    :param progress_bar: Display a progress bar using tqdm
     :return: The utilities on the plane, and the projections of the gradients
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range or of the wrong shape
@@ -115,7 +134,10 @@ def landscape(
     gradients = {} if gradients is None else gradients
     if not isinstance(gradients, Mapping):
         raise TypeError(f"gradients must be a dictionary of tensors by name, got {type(gradients).__name__}")
-    known = {name: check_directions(f"gradients[{name!r}]", given, (n,)) for name, given in gradients.items()}
+    known = {}
+    for name, given in gradients.items():
+        shape = (len(given), n) if isinstance(given, th.Tensor) and given.dim() == 2 else (n,)
+        known[name] = check_directions(f"gradients[{name!r}]", given, shape)
     if directions is None:
         drawn = th.randn(2, n, dtype=th.float64, generator=th.Generator().manual_seed(seed))
         plane = th.stack([filter_normalized(direction, utility.parameters) for direction in drawn])
@@ -124,12 +146,13 @@ def landscape(
         plane = directions / directions.norm(dim=1, keepdim=True) * utility.theta.norm()
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
-    with seeded(cast(ActorCriticPolicy, model.policy), seed):
+    bar = episode_bar(progress_bar, n_episodes * len(grid))
+    with seeded(cast(ActorCriticPolicy, model.policy), seed), bar as utility.bar:
         utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
     steps = {}
     for name, gradient in known.items():
-        projection = th.linalg.lstsq(plane.T, gradient[:, None]).solution[:, 0]
-        steps[name] = (extent * projection / projection.norm().clamp(min=1e-300)).numpy()
+        projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*gradient.shape[:-1], 2)
+        steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
     return Landscape(scales.numpy(), utilities.numpy(), steps)
 
 

@@ -29,8 +29,8 @@ __all__ = ["plot_baselines", "plot_landscape", "plot_learning_curves", "plot_var
 
 # Distinguishable with any colour vision (Okabe and Ito, 2008)
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-# Visible on the blue, green and yellow of a landscape
-ON_LANDSCAPE = ("#FFFFFF", "#D55E00", "#CC79A7", "#000000", "#E69F00")
+# Visible on the greys of a landscape, and apart from each other
+ON_LANDSCAPE = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7")
 # For greyscale prints
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
@@ -136,7 +136,8 @@ def plot_learning_curves(
         (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
     ax.set(xlabel="environment steps", ylabel="interquartile mean of the return")
-    ax.legend(title=f"bands: {confidence:.0%} intervals")
+    ax.set_title("Learning curves")
+    ax.legend(title=f"bands: {confidence:.0%} bootstrap intervals")
     return ax
 
 
@@ -165,42 +166,38 @@ def plot_variances(
         marker = MARKERS[index % len(MARKERS)]
         mean = variances.mean(axis=0)
         ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
-    ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance of the gradient")
+    ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance (trace of the covariance)")
+    ax.set_title("Variance of the gradient")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
     ax.xaxis.set_minor_locator(NullLocator())
     ax.grid(axis="y", alpha=0.3)
-    ax.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+    ax.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False, title=f"bars: {confidence:.0%} intervals")
     return ax
 
 
 def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     """
-    Plot U(θ) on a plane through θ in colours, and the directions of the gradients as arrows.
+    Plot U(θ) on a plane through θ in greys, and the gradients as arrows: several of one estimator are a fan.
 
     :param scape: The result of ``landscape``
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
     """
-    ax = new_axes(ax, (5.2, 4.8))
+    ax = new_axes(ax, (6.0, 5.6))
+    end = scape.scales[-1]
     # Interpolated between the points, where contours of noisy utilities would be ragged
-    colours = ax.pcolormesh(scape.scales, scape.scales, scape.utilities, shading="gouraud", cmap="viridis")
-    ax.figure.colorbar(colours, ax=ax, label="U(θ), mean return of an episode")
+    square = (-end, end, -end, end)
+    surface = ax.imshow(scape.utilities, cmap="Greys_r", origin="lower", extent=square, interpolation="bicubic")
+    ax.figure.colorbar(surface, ax=ax, label="U(θ), mean return of an episode")
+    for index, (name, steps) in enumerate(scape.steps.items()):
+        # The lengths differ by estimator, so that no fan hides another
+        x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
+        colour = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
+        arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
+        arrows.set(label=name, edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
-    for index, (name, (x, y)) in enumerate(scape.steps.items()):
-        ax.quiver(
-            *(0, 0, x, y),
-            angles="xy",
-            scale_units="xy",
-            scale=2,
-            color=ON_LANDSCAPE[index % len(ON_LANDSCAPE)],
-            edgecolor="black",
-            linewidth=0.5,
-            width=0.015,
-            label=name,
-        )
-    limits = (scape.scales[0], scape.scales[-1])
-    ax.set(xlim=limits, ylim=limits, xlabel="first direction", ylabel="second direction", aspect="equal")
-    ax.set_title("Utility on a plane through θ (the dot)")
+    ax.set(xlabel="first direction, in multiples of its norm", ylabel="second direction")
+    ax.set_title("Utility on a plane through θ (the dot), and directions\nof gradients (their lengths mean nothing)")
     if scape.steps:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, fontsize="small", facecolor="0.85")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize="small", frameon=False)
     return ax

@@ -12,16 +12,18 @@ from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
-from sb3_reinforce.diagnostics.tables import Estimate, interval, resamples
+from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
 from sb3_reinforce.envs.starts import check_groups
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import start_from, undisturbed
 
-# The predicted sizes of groups, and the number of episodes that is sampled from each start
+# Sizes of groups to predict, and episodes per start
 SIZES = (2, 4, 8)
 N_PER_START = SIZES[-1]
+# What is smaller, relative to the largest return, is rounding
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,15 @@ class StartReport:
 
     :param share: The share of the variance of the return that lies between starts, from 0 to 1
     :param gains: By m, the variance of the gradient with independent starts divided by the variance with
-        ``episodes_per_start=m``, both with ``"leave_one_out"`` and the same number of episodes. Above 1 it pays
+        ``episodes_per_start=m``, both with ``"leave_one_out"`` and rollouts of ``n_starts`` episodes. Above 1 it pays
     """
 
     share: Estimate
     gains: Mapping[int, Estimate]
 
     def __str__(self) -> str:
-        lines = [f"Share of the variance of the return between starts: {self.share}"]
-        lines += [f"episodes_per_start={m}: {gain} times less variance" for m, gain in self.gains.items()]
+        lines = [f"Share of the variance of the return between starts: {as_text(self.share)}"]
+        lines += [f"episodes_per_start={m}: variance divided by {as_text(gain)}" for m, gain in self.gains.items()]
         return "\n".join(lines)
 
 
@@ -50,9 +52,10 @@ def compare_starts(
     Measure whether groups of episodes that share their start would reduce the variance of the gradient.
 
     The model's policy plays eight episodes from each start, with the model's γ. What the environment draws after the
-    start is shared too, and counts as part of it.
+    start is shared too, and counts as part of it. Where all returns are equal, nothing is known, and all figures are
+    NaN. With few starts the intervals are too narrow. For images, it takes several passes over the episodes.
 
-    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param model: The model; it is not changed. Its environments get new seeds, and are left at the start of an episode
     :param n_starts: Number of starts, at least 4; rounded up until the environments play equal numbers of episodes
     :param n_resamples: Number of bootstrap resamples of the starts
     :param confidence: Probability with which an interval should cover the true value
@@ -88,11 +91,13 @@ def sample_starts(model: REINFORCE, n_starts: int) -> list[Rollout]:
     rollouts = []
     firsts = []
     with undisturbed(model):
-        # Pending seeds would replace those of the first episodes
+        # Pending seeds would replace the seeds of the first episodes
         env.reset()
         for part in seeds.reshape(-1, env.num_envs):
             firsts.append(start_from(collector, part))
             rollouts.append(collect_episodes(collector))
+        # Environments that have shared a start would go on with the same random numbers
+        env.seed(int(th.randint(2**31, ())))
         check_groups(stack([take(obs, i) for obs in firsts for i in range(env.num_envs)]), N_PER_START)
     return rollouts
 
@@ -122,7 +127,10 @@ def gram_matrices(rollouts: list[Rollout], returns: th.Tensor, used: th.Tensor) 
     for m in SIZES:
         groups = (*returns.shape[:2], -1, m)
         baselines[m] = leave_one_out(returns.reshape(groups), used.reshape(groups), dim=3).reshape(returns.shape)
-    weights = [((returns - b) * used).flatten(1) for b in baselines.values()]
+    residuals = [(returns - b) * used for b in baselines.values()]
+    # Equal returns differ from their mean by rounding
+    zero = ROUNDING * returns.abs().max()
+    weights = [th.where(each.abs() > zero, each, 0.0).flatten(1) for each in residuals]
     n_envs = rollouts[0].dones.shape[1]
     blocks = []
     for i, rollout in enumerate(rollouts):
@@ -145,7 +153,9 @@ def share_between(returns: th.Tensor, counts: th.Tensor) -> th.Tensor:
 
     The means of k episodes vary by ``σ²_between + σ²_within / k`` (Searle, Casella and McCulloch, 1992, chapter 3).
     """
-    means = returns.mean(1)
-    within = counts @ returns.var(1) / counts.sum(1)
+    centred = returns - returns.mean()
+    centred = th.where(centred.abs() > ROUNDING * returns.abs().max(), centred, 0.0)
+    means = centred.mean(1)
+    within = counts @ centred.var(1) / counts.sum(1)
     between = (variance(compute_moments(means[:, None] * means, counts)) - within / returns.shape[1]).clamp(min=0)
     return between / (between + within)

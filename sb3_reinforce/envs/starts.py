@@ -7,6 +7,8 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_reinforce.envs.checks import check_finite
+
 
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     """The first observations of episodes, environment i with the seed ``seeds[i]``."""
@@ -19,26 +21,37 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
             except NotImplementedError as error:
                 raise ValueError(
                     "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
-                    f"{type(env.unwrapped).__name__} does not have here: set common_random_numbers=False for a "
-                    "FiniteDifference, episodes_per_start=1 for a REINFORCE"
+                    f"{type(env.unwrapped).__name__} does not have here: set common_random_numbers=False or "
+                    "episodes_per_start=1, or use another VecEnv"
                 ) from error
     return env.reset()
 
 
 def start_groups(env: VecEnv, size: int) -> Any:
-    """The first observations of episodes, each start of which ``size`` neighbouring environments share."""
-    seeds = th.randint(2**31, (env.num_envs // size,)).numpy()
-    obs = start_episodes(env, seeds.repeat(size))
+    """First observations; each group of ``size`` neighbouring environments shares a start."""
+    seeds = th.randint(2**31, (env.num_envs // size,)).numpy().repeat(size)
+    obs = start_episodes(env, seeds)
+    if not are_alike(obs, size):
+        # Seeds that were pending have replaced these, and are used up now
+        obs = start_episodes(env, seeds)
     check_groups(obs, size)
     return obs
 
 
-def check_groups(obs: Any, size: int) -> None:
-    """Refuse first observations that differ between ``size`` neighbours, which had the same seed."""
+def are_alike(obs: Any, size: int) -> bool:
+    """Whether the observations of each ``size`` neighbours are equal."""
     for part in obs.values() if isinstance(obs, dict) else [obs]:
         by_start = part.reshape(-1, size, *part.shape[1:])
         if not np.array_equal(by_start, np.broadcast_to(by_start[:, :1], by_start.shape)):
-            raise ValueError(
-                "Episodes cannot share their start: after reset(seed=...) with the same seed and another reset, the "
-                "observations differ. The environment must draw all random numbers from self.np_random"
-            )
+            return False
+    return True
+
+
+def check_groups(obs: Any, size: int) -> None:
+    """Refuse first observations that differ between ``size`` neighbours, which had the same seed."""
+    check_finite("The observation", obs, (None,))
+    if not are_alike(obs, size):
+        raise ValueError(
+            "Episodes cannot share their start: after reset(seed=...) with the same seed and another reset, the "
+            "observations differ. The environment must draw all random numbers from self.np_random"
+        )

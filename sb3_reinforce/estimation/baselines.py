@@ -5,8 +5,8 @@ A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. I
 b_t does not depend on the action at t or on its consequences (Williams, 1992, theorem 1). A user's own function is a
 baseline too.
 
-"Other episodes" are those of the same group: all of the rollout, or with ``episodes_per_start`` those from the same
-start. ``mean`` always takes all.
+"Other episodes" are the others of the same group: of the rollout, or with ``episodes_per_start`` of the same start.
+``mean`` always takes all.
 """
 
 from collections.abc import Callable

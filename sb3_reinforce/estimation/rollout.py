@@ -31,9 +31,9 @@ class Rollout:
     :param policy: The policy that acted, with the parameters with which it acted
     :param denominator: What the sum over all steps is divided by
     :param next_values: V(s_{t+1}), which is 0 after a terminal state, float64; None without ``baseline="value"``
-    :param episodes_per_start: The number of neighbouring environments whose episodes start alike; 1 if all differ
     :param state: The state of a recurrent policy before the first step, shape
         ``(n_envs, 2, 2, n_layers, n_hidden)`` for actor and critic, hidden and cell state; None if all start from zero
+    :param episodes_per_start: The number of neighbouring environments whose episodes start alike; 1 if all differ
     """
 
     observations: PyTorchObs
@@ -48,8 +48,8 @@ class Rollout:
     policy: ActorCriticPolicy
     denominator: int
     next_values: th.Tensor | None = None
-    episodes_per_start: int = 1
     state: th.Tensor | None = None
+    episodes_per_start: int = 1
 
     @property
     def episodes(self) -> th.Tensor:
@@ -61,7 +61,7 @@ class Rollout:
         """
         The number of the group whose returns are compared, shape ``(n_steps, n_envs)``, int64.
 
-        It is that of the start, or 0 for all where each episode has a start to itself.
+        The number of the start, or 0 for all where each episode has a start to itself.
         """
         n_steps, n_envs = self.dones.shape
         numbers = th.arange(n_envs) // (n_envs if self.episodes_per_start == 1 else self.episodes_per_start)
@@ -88,6 +88,13 @@ class Running:
     def none(cls, n_envs: int) -> "Running":
         """Every environment is at the start of an episode."""
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
+
+    def unless(self, starts: Bools) -> "Running":
+        """The episodes that go on where none ``starts``, without the episodes of further environments."""
+        n_envs = len(starts)
+        if starts.all():
+            return Running.none(n_envs)
+        return Running(np.where(starts, 0, self.timesteps[:n_envs]), np.where(starts, 0.0, self.rewards[:n_envs]))
 
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""

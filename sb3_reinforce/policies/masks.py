@@ -135,7 +135,7 @@ class MaskedExtractor(BaseFeaturesExtractor):
 
 
 class MaskedMlpExtractor(nn.Module):
-    """The latents of the actor with the mask behind them, and those of the critic without."""
+    """The latents of the actor with the mask behind them, and the critic's latents without it."""
 
     def __init__(self, extractor: MlpExtractor, n_actions: int):
         super().__init__()
@@ -173,7 +173,7 @@ class MaskedPolicy(ActorCriticPolicy):
     An ``ActorCriticPolicy`` that takes no action which the observation forbids, for any algorithm that trains one.
 
     π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
-    log π, its gradient and the entropy are those of that distribution. Where nothing is allowed, as in terminal states,
+    log π, its gradient and the entropy belong to that distribution. Where nothing is allowed, as in terminal states,
     all actions are. The critic and the features do not see the mask. A2C and PPO need action spaces that start at 0.
 
     :param observation_space: A ``Dict`` with the key ``"action_mask"`` and at least one more

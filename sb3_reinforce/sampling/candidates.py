@@ -92,7 +92,7 @@ def evaluate_candidates(
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
         env.reset()
     queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(len(thetas))]
-    size = len(queue) if seeds is None else env.num_envs
+    size = max(1, len(queue)) if seeds is None else env.num_envs
     for first in range(0, len(queue), size):
         tracker = EpisodeTracker(queue[first : first + size], env.num_envs, max_episode_steps)
         starts = None if seeds is None else np.array([seeds[pair] for pair in tracker.pairs])

@@ -46,15 +46,20 @@ class EpisodicUtility:
         n_columns = candidates.shape[1] if candidates.dim() == 3 else 1
         columns = np.arange(len(thetas)) % n_columns
         seeds = (self.first_seed + columns[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
+        processes = model._processes
+        # Each process evaluates a part of the candidates
+        own = slice(None) if processes is None else np.array_split(range(len(thetas)), processes.size)[processes.rank]
         returns = evaluate_candidates(
             self.actor,
             model.env,
-            thetas,
-            seeds if model.common_random_numbers else None,
+            thetas[own],
+            seeds[own] if model.common_random_numbers else None,
             n_episodes,
             model.max_episode_steps,
             self._on_step,
         )
+        if processes is not None:
+            returns = np.concatenate(processes.exchange(returns))
         values = th.as_tensor(returns).mean(1)
         self.candidates.append(thetas)
         self.values.append(values)

@@ -6,14 +6,18 @@ import importlib
 import io
 import os
 import runpy
+import secrets
 import subprocess
 import sys
+from collections.abc import Iterator
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
 from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
+from sb3_reinforce.common.processes import Processes, is_leader, place
 from sb3_reinforce.zoo import ALGORITHMS
 from sb3_reinforce.zoo.experiments import ConfigurationError, closest
 
@@ -61,6 +65,22 @@ def run_script(command: str) -> None:
         runpy.run_module(SCRIPTS[command], run_name="__main__")
     finally:
         subprocess.call = call
+
+
+@contextlib.contextmanager
+def one_of_several(arguments: list[str]) -> Iterator[list[str]]:
+    """The arguments of ``train`` with a seed that all processes share; process 0 alone prints and keeps its folder."""
+    if place() == (0, 1):
+        yield arguments
+        return
+    with Processes() as processes:
+        seed = processes.exchange(secrets.randbelow(2**31))[0]
+    arguments = ["--seed", str(seed), *arguments]
+    if is_leader():
+        yield arguments
+        return
+    with TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        yield [*arguments, "--log-folder", folder]
 
 
 def import_packages(command: str, arguments: list[str]) -> list[str]:
@@ -157,7 +177,10 @@ def main() -> None:
             arguments = import_packages(command, arguments)
             check(parser, command, arguments)
         sys.argv = [f"{parser.prog} {command}", *arguments]
-        if command in FUNCTIONS:
+        if command == "train":
+            with one_of_several(arguments) as sys.argv[1:]:
+                importlib.import_module(FUNCTIONS[command]).train()
+        elif command in FUNCTIONS:
             getattr(importlib.import_module(FUNCTIONS[command]), command)()
         else:
             run_script(command)

@@ -1,5 +1,8 @@
 """Groups of episodes that share their start."""
 
+import runpy
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +14,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE, GymnasiumVecEnv
+from sb3_reinforce.diagnostics import compare_starts, sample
 from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 ENVS = {
     "DummyVecEnv": lambda: make_vec_env("Pendulum-v1", 6, seed=0),
@@ -49,10 +54,11 @@ class Starts:
 def test_baselines_compare_within_the_group():
     """Returns 10 x ± 1 of one step: the others of the group are those with the same x."""
     model = REINFORCE(
-        "MlpPolicy", DummyVecEnv([lambda: Scales(10.0)] * 8), baseline="none", episodes_per_start=4, seed=1
+        "MlpPolicy", DummyVecEnv([lambda: Scales(10.0)] * 8), baseline="time_mean", episodes_per_start=4, seed=1
     ).learn(8)
     rollout = model.rollout
     returns = rollout.returns[0].reshape(2, 4)
+    assert returns[0, 0] * returns[1, 0] < 0, "another seed: the starts are equal"
     assert (rollout.groups[0].reshape(2, 4) == th.tensor([[0], [1]])).all()
     assert (returns > 0).any(1).eq((returns > 0).all(1)).all()
     mean = returns.mean(1, keepdim=True).expand(2, 4).flatten()
@@ -82,10 +88,15 @@ def test_dicts_are_compared_key_by_key():
             self.observation_space = spaces.Dict({"a": env.observation_space, "b": env.observation_space})
 
         def observation(self, obs):
-            return {"a": obs, "b": 1 - np.abs(obs)}
+            return {"a": 0 * obs, "b": obs}
 
-    env = DummyVecEnv([lambda: Dicts(Scales())] * 4)
-    REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2).learn(8)
+    def model_of(**kwargs):
+        env = DummyVecEnv([lambda: Dicts(Scales(**kwargs))] * 4)
+        return REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2)
+
+    assert model_of().learn(8).num_timesteps == 8
+    with pytest.raises(ValueError, match="cannot share their start"):
+        model_of(ignores_seed=True).learn(8)
 
 
 def test_what_cannot_share_its_start_is_refused():
@@ -93,5 +104,63 @@ def test_what_cannot_share_its_start_is_refused():
     with pytest.raises(ValueError, match="cannot share their start"):
         REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0).learn(8)
     for kwargs in ({"n_episodes": 16}, {"n_steps": 8}, {"episodes_per_start": 3}):
-        with pytest.raises(ValueError, match=r"episodes_per_start=. needs a rollout of one episode"):
-            REINFORCE("MlpPolicy", env, **{"episodes_per_start": 4, **kwargs})
+        with pytest.raises(ValueError, match=r"episodes_per_start=. needs one whole episode of each environment"):
+            REINFORCE("MlpPolicy", env, **{"baseline": "leave_one_out", "episodes_per_start": 4, **kwargs})
+    with pytest.raises(ValueError, match="compares the episodes of a start"):
+        REINFORCE("MlpPolicy", env, episodes_per_start=4)
+
+
+def test_what_a_callback_changes_is_checked():
+    def change(locals_, globals_):
+        locals_["self"].n_episodes = 16
+        return True
+
+    env = DummyVecEnv([Scales] * 8)
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0)
+    with pytest.raises(ValueError, match="n_episodes=8"):
+        model.learn(64, callback=change)
+
+
+def test_pending_seeds_are_used_up():
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0).learn(1)
+    env.seed(3)
+    starts = []
+    model.learn(1, callback=Starts(starts), reset_num_timesteps=False)
+    assert (starts[0][0] == starts[0][1]).all() and (starts[0][1] != starts[0][2]).any()
+
+
+@pytest.mark.parametrize("measure", [sample, compare_starts])
+def test_after_groups_the_environments_are_independent_again(measure):
+    env = make_vec_env("Pendulum-v1", 8, seed=0)
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0).learn(1)
+    found = measure(model, 8)
+    if measure is sample:
+        assert len(np.unique(found.observations[0], axis=0)) == 8
+    assert len(np.unique(env.reset(), axis=0)) == 8
+
+
+def test_memory_takes_one_episode_of_each_environment():
+    model = RecurrentREINFORCE("MlpLstmPolicy", DummyVecEnv([Scales] * 8), baseline="optimal", episodes_per_start=4)
+    assert model.learn(8).rollout.episodes_per_start == 4
+
+
+def test_a_model_can_be_loaded_for_other_numbers_of_environments(tmp_path):
+    env = DummyVecEnv([Scales] * 8)
+    REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0).save(tmp_path / "model")
+    assert REINFORCE.load(tmp_path / "model").n_episodes == 8
+    loaded = REINFORCE.load(tmp_path / "model", env=DummyVecEnv([Scales]))
+    with pytest.raises(ValueError, match="n_episodes=1"):
+        loaded.learn(8)
+    REINFORCE.load(tmp_path / "model", env=DummyVecEnv([Scales] * 12), n_episodes=12).learn(12)
+
+
+@pytest.mark.slow
+def test_half_of_the_episodes_do_where_starts_differ():
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "14_common_starts.py"))
+    better = 0
+    for seed in range(5):
+        alone = example["cost_by_episodes"](example["make_model"](1, seed))
+        grouped = example["cost_by_episodes"](example["make_model"](8, seed), 2)
+        better += grouped[-1] <= alone[-1]
+    assert better >= 4

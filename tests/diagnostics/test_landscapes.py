@@ -74,7 +74,7 @@ def test_by_default_every_estimator_sees_something_on_cartpole():
 
 
 def test_a_single_name_is_an_estimator():
-    assert compare_estimators(bandit(), 10, 3, "central").names == ["central"]
+    assert compare_estimators(bandit(), 10, 3, "central", progress_bar=True).names == ["central"]
 
 
 def test_a_landscape_rises_along_the_gradient():
@@ -121,7 +121,10 @@ def test_every_picture_can_be_saved(tmp_path):
     ax = plots.plot_learning_curves({"a": np.random.rand(5, 8), "b": np.random.rand(4, 3, 8)}, np.arange(8))
     assert [line.get_label() for line in ax.get_lines()] == ["a (5 runs)", "b (4 runs)"]
     save(ax, tmp_path / "curves.png")
-    ax = plots.plot_landscape(landscape(bandit(), {"g": th.ones(4)}, n_points=3, n_episodes=2))
+    fans = {"one": th.ones(4), "three": th.randn(3, 4)}
+    found = landscape(bandit(), fans, n_points=3, n_episodes=2, progress_bar=True)
+    assert [steps.shape for steps in found.steps.values()] == [(2,), (3, 2)]
+    ax = plots.plot_landscape(found)
     assert ax.get_title() and ax.get_xlim() == (-1, 1)
     save(ax, tmp_path / "landscape.png")
     ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])
@@ -148,3 +151,9 @@ def test_curves_of_a_single_run_are_refused():
     for wrong in (np.ones((1, 8)), np.ones((3, 7)), np.ones(8)):
         with pytest.raises(ValueError, match=r"runs\['a'\]"):
             plots.plot_learning_curves({"a": wrong}, np.arange(8))
+
+
+def test_afterwards_the_environments_are_independent():
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    landscape(REINFORCE("MlpPolicy", env, device="cpu"), n_points=2, n_episodes=1)
+    assert len(np.unique(env.reset(), axis=0)) == 4

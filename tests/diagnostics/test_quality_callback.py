@@ -41,6 +41,11 @@ def test_it_logs_every_so_many_rollouts():
     assert -1 <= history["gradient/cosine"][0] <= 1
 
 
+def test_episodes_of_one_start_are_not_taken_for_independent():
+    history = train(GradientQualityCallback(1), 1024, baseline="leave_one_out", episodes_per_start=2).logger.history
+    assert {key for key in history if key.startswith("gradient/")} == {"gradient/cosine"}
+
+
 def test_it_serves_one_model_after_another():
     callback = GradientQualityCallback(1)
     histories = [train(callback).logger.history for _ in range(2)]

@@ -1,12 +1,18 @@
 """The share of the variance between starts, and what groups would gain, on a task where both are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from environments import Scales
+import torch as th
+from environments import Corridor, Scales, Tree
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_starts
+from sb3_reinforce.diagnostics.start_comparison import gram_matrices, sample_starts, side_by_side
+from sb3_reinforce.diagnostics.statistics import gram
+from sb3_reinforce.estimation import gradients_by_episode, leave_one_out
 
 
 def make_model(n_envs=16, **kwargs):
@@ -57,6 +63,34 @@ def test_what_cannot_be_compared_is_refused():
         compare_starts(make_model(), n_starts=3)
     with pytest.raises(TypeError, match="model must be a REINFORCE"):
         compare_starts(None)
+
+
+@pytest.mark.parametrize("env", [lambda: Tree(ragged=True), lambda: Corridor((1, 2, 6), lambda t, a: t + a)])
+def test_ragged_episodes_have_the_gradients_of_training(env):
+    """The lengths differ within groups of eight, or between them; the baseline is the one that training would have."""
+    model = REINFORCE("MlpPolicy", DummyVecEnv([env] * 8), baseline="leave_one_out", seed=0)
+    rollouts = sample_starts(model, 8)
+    returns = side_by_side([rollout.returns * rollout.used for rollout in rollouts])
+    used = side_by_side([rollout.used.double() for rollout in rollouts])
+    assert not used.all()
+    grams = gram_matrices(rollouts, returns, used)
+    for m in (2, 4, 8):
+        means = []
+        for rollout in rollouts:
+            grouped = replace(rollout, episodes_per_start=m)
+            [gradients] = gradients_by_episode(grouped, grouped.returns - leave_one_out(grouped))
+            means.append(gradients.double().reshape(-1, m, gradients.shape[1]).mean(1))
+        found = th.stack(means)
+        expected = gram(found.mean(1))
+        expected.diagonal().copy_(found.square().sum(2).mean(1))
+        th.testing.assert_close(grams[m], expected)
+
+
+def test_where_all_returns_are_equal_nothing_is_known():
+    model = REINFORCE("MlpPolicy", DummyVecEnv([lambda: Corridor((3,), lambda t, action: 0.1 + t)] * 8), seed=0)
+    report = compare_starts(model, n_starts=8)
+    assert all(np.isnan(estimate.value) for estimate in (report.share, *report.gains.values()))
+    assert "nan" not in str(report)
 
 
 def test_the_report_can_be_read():

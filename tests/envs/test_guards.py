@@ -18,6 +18,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
+IS_OLD = np.lib.NumpyVersion(np.__version__) < "1.25.0"
+OF_ONE = pytest.param(np.ones(1), marks=pytest.mark.skipif(IS_OLD, reason="NumPy took it for a number"))
 bare_or_normalized = pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 
 
@@ -204,7 +206,7 @@ def test_rewards_that_are_no_numbers(wrapper, value, kind):
 
 
 @all_kinds
-@pytest.mark.parametrize("value", ["x", np.ones(1), np.ones(2), None], ids=repr)
+@pytest.mark.parametrize("value", ["x", OF_ONE, np.ones(2), None], ids=repr)
 def test_rewards_that_monitor_cannot_add_up(value, kind):
     env = DummyVecEnv([lambda: Monitor(Faulty()), lambda: Monitor(Faulty("reward", 5, value))])
     with pytest.raises(ValueError, match=r"reward of environment 1 must be a number, got .*\(step 4 since"):

@@ -1,0 +1,209 @@
+"""The tables of results, computed from the CSVs in ``examples/benchmarks/results``."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+RESULTS = Path(__file__).parents[2] / "examples" / "benchmarks" / "results"
+LABELS = {
+    "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
+    "reinforce_lstm": "RecurrentREINFORCE", "ppo_lstm": "RecurrentPPO", "vpg": "VPG",
+}  # fmt: skip
+NONE = "–"
+# The task of the README's table for each kind of action, observation and length of episode
+README_TASKS = ("CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1", "Acrobot-v1", "LunarLander-v3")
+
+
+def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table in Markdown."""
+    header = list(header)
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def read(name: str) -> pd.DataFrame:
+    """A file of results."""
+    return pd.read_csv(RESULTS / f"{name}.csv")
+
+
+def number(value: float, digits: int = 1) -> str:
+    """A number with a true minus sign; thousands have no decimals."""
+    return f"{value:.{0 if abs(value) >= 1000 else digits}f}".replace("-", "−")
+
+
+def short(steps: int) -> str:
+    """A number of steps: 200k, 1M."""
+    return f"{steps // 1_000_000}M" if steps % 1_000_000 == 0 else f"{steps // 1000}k"
+
+
+def spread(values: pd.Series, digits: int = 1) -> str:
+    """The median of the seeds, and the least and greatest."""
+    if values.empty:
+        return NONE
+    return f"{number(values.median(), digits)} ({number(values.min(), digits)}, {number(values.max(), digits)})"
+
+
+def published(task: str, sources: str = "RL Zoo") -> str:
+    """What others publish for a task, with their numbers of steps."""
+    rows = read("published")
+    mine = rows[(rows["task"] == task) & rows["source"].str.startswith(sources)]
+    texts = [f"{LABELS[row.algorithm]} {number(row['return'])} [{short(row.timesteps)}]" for _, row in mine.iterrows()]
+    return ", ".join(texts) or NONE
+
+
+def final(*names: str) -> pd.DataFrame:
+    """The final evaluations of one or more comparisons."""
+    rows = pd.concat([read(name) for name in names])
+    return rows[rows["evaluation"] == "final"]
+
+
+def comparison() -> str:
+    """REINFORCE, A2C and PPO on every task that REINFORCE was run on."""
+    rows = final("comparison", "comparison_others")
+    lines = []
+    for (task, budget), runs in rows[rows["algorithm"] == "reinforce"].groupby(["task", "budget"], sort=False):
+        same = rows[(rows["task"] == task) & (rows["budget"] == budget)]
+        cells = [spread(same[same["algorithm"] == name]["return"]) for name in ("reinforce", "a2c", "ppo")]
+        lines.append([f"{task} ({short(budget)})", str(runs["seed"].nunique()), *cells, published(task)])
+    return markdown(["task (steps)", "seeds", "REINFORCE", "A2C", "PPO", "the Zoo's own, one run each"], lines)
+
+
+def seconds() -> str:
+    """The seconds of a core that the same runs took."""
+    rows = final("comparison", "comparison_others")
+    lines = []
+    for task, runs in rows[rows["algorithm"].isin(["reinforce", "a2c", "ppo"])].groupby("task", sort=False):
+        medians = runs.groupby("algorithm")["cpu_seconds"].median()
+        # One algorithm alone has no one to be compared with
+        if len(medians) > 1:
+            cells = [number(medians[name], 0) if name in medians else NONE for name in ("reinforce", "a2c", "ppo")]
+            lines.append([task, *cells])
+    return markdown(["task", "REINFORCE", "A2C", "PPO"], lines)
+
+
+def searches() -> str:
+    """FiniteDifference and ARS by the comparison's own protocol."""
+    rows = final("comparison_others")
+    lines = []
+    for (task, budget), runs in rows[rows["algorithm"] == "finite_difference"].groupby(["task", "budget"], sort=False):
+        cells = []
+        for name in ("finite_difference", "ars"):
+            same = rows[(rows["task"] == task) & (rows["algorithm"] == name)]
+            cells += [spread(same["return"]), number(same["cpu_seconds"].median(), 0)]
+        lines.append([f"{task} ({short(budget)})", str(runs["seed"].nunique()), *cells])
+    return markdown(["task (steps)", "seeds", "FiniteDifference", "seconds", "ARS", "seconds"], lines)
+
+
+def readme() -> str:
+    """The README's small table."""
+    rows = final("comparison")
+    lines = []
+    for task in README_TASKS:
+        same = rows[rows["task"] == task]
+        cells = [spread(same[same["algorithm"] == name]["return"]) for name in ("reinforce", "a2c", "ppo")]
+        lines.append([f"{task} ({short(same['budget'].iloc[0])})", *cells])
+    return markdown(["task (steps)", "REINFORCE", "A2C", "PPO"], lines)
+
+
+def memory() -> str:
+    """RecurrentREINFORCE on tasks without velocities, beside RecurrentPPO where it was run."""
+    rows = final("memory")
+    lines = []
+    for (task, budget), runs in rows[rows["algorithm"] == "reinforce_lstm"].groupby(["task", "budget"], sort=False):
+        peer = rows[(rows["task"] == task) & (rows["algorithm"] == "ppo_lstm")]
+        theirs = [NONE, NONE]
+        if len(peer):
+            theirs = [f"{spread(peer['return'])} [{short(peer['budget'].iloc[0])}]"]
+            theirs.append(number(peer["cpu_seconds"].median(), 0))
+        ours = [f"{spread(runs['return'])} [{short(budget)}]", number(runs["cpu_seconds"].median(), 0)]
+        lines.append([task, *ours, *theirs, published(task)])
+    return markdown(["task", "RecurrentREINFORCE", "seconds", "RecurrentPPO", "seconds", "the Zoo's own"], lines)
+
+
+def t_maze() -> str:
+    """The mean return in the T-maze of each memory, a number per seed."""
+    lines = []
+    for (name, length, steps), runs in read("t_maze").groupby(["memory", "length", "timesteps"], sort=False):
+        returns = ", ".join(number(value, 2) for value in runs["mean_return"])
+        lines.append([f"`{name}`", str(length), short(steps), returns])
+    return markdown(["memory", "corridor", "steps", "mean return of each seed"], lines)
+
+
+def masks() -> str:
+    """Medians of the seeds after growing numbers of steps, with the least after the last."""
+    rows = read("masks")
+    steps = sorted(rows["timesteps"].unique())
+    lines = []
+    for name, runs in rows.groupby("algorithm", sort=False):
+        returns = [runs[runs["timesteps"] == step]["return"] for step in steps]
+        cells = [number(values.median(), 2) for values in returns[:-1]]
+        lines.append([name, *cells, f"{number(returns[-1].median(), 2)} ({number(returns[-1].min(), 2)})"])
+    header = ["steps", *(str(step) for step in steps[:-1]), f"{steps[-1]} (least)"]
+    return markdown(header, lines)
+
+
+def masks_speed() -> str:
+    """How many times the steps per second of the CPU REINFORCE makes: the median of the seeds, least and greatest."""
+    rows = read("masks")
+    last = rows[rows["timesteps"] == rows["timesteps"].max()].pivot(
+        index="seed", columns="algorithm", values="cpu_seconds"
+    )
+    return spread(last["MaskablePPO"] / last["REINFORCE"])
+
+
+def search_vs_ars() -> str:
+    """Mean of the seeds, and each seed."""
+    lines = []
+    for (env, budget), runs in read("search_vs_ars").groupby(["env", "budget"], sort=False):
+        cells = []
+        for name in ("FiniteDifference", "ARS"):
+            returns = runs[runs["algorithm"] == name].sort_values("seed")["mean_return"]
+            cells.append(f"{number(returns.mean())} ({', '.join(number(value) for value in returns)})")
+        lines.append([f"{env} ({short(budget)})", *cells])
+    return markdown(["environment (steps)", "FiniteDifference: mean (each seed)", "ARS"], lines)
+
+
+def common_random_numbers() -> str:
+    """What equal starts save in variance, and what they cost in steps."""
+    rows = read("common_random_numbers")
+    lines = []
+    for env, runs in rows.groupby("env", sort=False):
+        columns = (runs["variance_ratio"], runs["steps_ratio"])
+        cells = [", ".join(f"{ratio:.1f}" for ratio in column) for column in columns]
+        lines.append([env, ", ".join(runs["estimator"]), *cells])
+    return markdown(["environment", "estimators", "variance without / with", "steps with / without"], lines)
+
+
+def search_throughput() -> str:
+    """Gradients a second beside ARS."""
+    lines = [
+        [row["env"], row["policy"], f"{row['median']} ({row['least']}, {row['greatest']})"]
+        for _, row in read("search_throughput").iterrows()
+    ]
+    return markdown(["environment", "policy", "FiniteDifference / ARS: median (least, greatest)"], lines)
+
+
+def throughput() -> str:
+    """Steps a second of learning, as ratios."""
+    rows = read("throughput")
+    lines = [
+        [f"{row['env']}, {row['n_envs']}", *(f"{row[name]:.3g}" for name in rows.columns[2:])]
+        for _, row in rows.iterrows()
+    ]
+    return markdown(["environments", *(name.replace("raw", "VecEnv") for name in rows.columns[2:])], lines)
+
+
+def images() -> str:
+    """Steps a second from images beside A2C, for each number of environments."""
+    texts = [f"{row['REINFORCE / A2C']:.2f}" for _, row in read("images").iterrows()]
+    return ", ".join(texts)
+
+
+def all_tables() -> dict[str, str]:
+    """What pages write as ``{{ name }}``."""
+    functions = (
+        comparison, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars, common_random_numbers,
+        search_throughput, throughput, images,
+    )  # fmt: skip
+    return {function.__name__: function() for function in functions}

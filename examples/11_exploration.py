@@ -1,0 +1,140 @@
+# %% [markdown]
+# # When should a policy stay random?
+#
+# A policy gradient climbs from where it stands. Randomness lets it see what lies beyond, and sometimes the best policy
+# is itself random.
+
+# %%
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_reinforce import REINFORCE
+
+seed = 0
+th.set_num_threads(1)
+common = {"baseline": "leave_one_out", "n_episodes": 32, "seed": seed, "device": "cpu"}
+
+# %% [markdown]
+# ## A local optimum
+#
+# The action is a number. Near −1 it earns up to 0.5, near 2 up to 1, and nothing in between. A Gaussian policy with the
+# mean −1 and the standard deviation 0.3 never sees the higher hill, and its gradient leads to the top of the lower one.
+# With a floor under the standard deviation (`min_std`) the policy sees both.
+
+
+# %%
+class Hills(gym.Env):
+    """One step; the reward has two hills."""
+
+    observation_space, action_space = spaces.Box(1, 1, (1,)), spaces.Box(-4, 4, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        reward = 0.5 * np.exp(-((action[0] + 1) ** 2)) + np.exp(-((action[0] - 2) ** 2))
+        return np.ones(1, dtype=np.float32), float(reward), True, False, {}
+
+
+means = {}
+for min_std in (0.0, 1.5):
+    policy_kwargs = {"net_arch": [], "log_std_init": np.log(0.3)}
+    env = make_vec_env(Hills, 8, seed=seed)
+    model = REINFORCE("MlpPolicy", env, learning_rate=0.02, min_std=min_std, policy_kwargs=policy_kwargs, **common)
+    model.policy.action_net.bias.data.fill_(-1.0)
+    model.learn(20_000)
+    means[min_std] = float(model.predict(np.ones(1, dtype=np.float32), deterministic=True)[0][0])
+    print(f"min_std = {min_std}: the mean action is {means[min_std]:+.2f}")
+assert means[0.0] < -0.7 and means[1.5] > 1
+
+# %% [markdown]
+# ## Temperature and entropy
+#
+# Two arguments keep a policy of discrete actions random, and both can be schedules: `temperature` divides the logits,
+# and `ent_coef` rewards entropy. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. A
+# policy that commits itself early may commit itself to the wrong arm. A schedule lets it explore first and decide
+# later.
+
+
+# %%
+class Arms(gym.Env):
+    """One step, three noisy rewards."""
+
+    observation_space, action_space = spaces.Box(1, 1, (1,)), spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        return np.ones(1, dtype=np.float32), self.np_random.normal(1.0 + 0.1 * action), True, False, {}
+
+
+def probabilities(model, observation):
+    """π(·|s)."""
+    with th.no_grad():
+        return model.policy.get_distribution(th.as_tensor(observation)[None]).distribution.probs[0]
+
+
+schedules = {
+    "neither": {},
+    "ent_coef falls from 0.5 to 0": {"ent_coef": LinearSchedule(0.5, 0.0, 1.0)},
+    "temperature falls from 5 to 0.1": {"temperature": LinearSchedule(5.0, 0.1, 1.0)},
+}
+entropies = {}
+for name, arguments in schedules.items():
+    found = entropies[name] = []
+
+    def watch(local, _, found=found):
+        """Called after each step: the entropy after a tenth of the training, and at its end."""
+        if local["self"].num_timesteps in (1_000, 10_000):
+            p = probabilities(local["self"], np.ones(1, dtype=np.float32))
+            found.append(-float((p * p.clamp(min=1e-12).log()).sum()))
+        return True
+
+    env = make_vec_env(Arms, 8, seed=seed)
+    model = REINFORCE("MlpPolicy", env, learning_rate=0.03, policy_kwargs={"net_arch": []}, **arguments, **common)
+    model.learn(10_000, callback=watch)
+    p = probabilities(model, np.ones(1, dtype=np.float32)).tolist()
+    print(f"{name:32s} entropy {found[0]:.2f}, then {found[1]:.2f}; π = {', '.join(f'{each:.2f}' for each in p)}")
+assert all(early > entropies["neither"][0] for early, _ in list(entropies.values())[1:])
+assert entropies["temperature falls from 5 to 0.1"][1] < 0.3
+
+# %% [markdown]
+# ## A problem whose best policy is random
+#
+# A corridor of three cells that look alike (Sutton and Barto, 2018, example 13.1). In the middle cell left and right
+# are exchanged. Each step costs 1 until the end on the right is reached. Always right and always left never arrive; the
+# best policy goes right with probability $2 - \sqrt 2 \approx 0.59$, and needs 11.7 steps. Q-learning with greedy
+# actions cannot represent it. A softmax can.
+
+
+# %%
+class Corridor(gym.Env):
+    """Three cells, one observation."""
+
+    observation_space, action_space = spaces.Box(1, 1, (1,)), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cell = 0
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        is_right = bool(action) != (self.cell == 1)
+        self.cell = max(0, self.cell + (1 if is_right else -1))
+        return np.ones(1, dtype=np.float32), -1.0, self.cell == 3, False, {}
+
+
+env = make_vec_env(Corridor, 8, seed=seed)
+model = REINFORCE("MlpPolicy", env, gamma=1.0, learning_rate=0.01, policy_kwargs={"net_arch": []}, **common)
+model.learn(30_000)
+right = probabilities(model, np.ones(1, dtype=np.float32))[1].item()
+length = np.mean([info["l"] for info in model.ep_info_buffer])
+print(f"π(right) = {right:.2f}, mean length of the last 100 episodes {length:.1f}")
+assert abs(right - (2 - 2**0.5)) < 0.12

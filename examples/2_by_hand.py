@@ -1,0 +1,137 @@
+# %% [markdown]
+# # What does one update do?
+#
+# One state and two actions: Left earns −1, Right earns 5. The policy has a single parameter, $\pi_\theta(\text{Right})
+# = \sigma(\theta) = 1 / (1 + e^{-\theta})$. One update from three episodes fits on a page.
+
+# %%
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import sample
+from sb3_reinforce.estimation import gradients_by_episode, leave_one_out, mean
+
+seed = 0
+th.set_num_threads(1)
+th.manual_seed(seed)
+
+# %% [markdown]
+# ## By hand
+#
+# The score of an action is $\nabla_\theta \log \pi_\theta(a)$: here $1 - \pi(\text{Right})$ for Right and
+# $-\pi(\text{Right})$ for Left. At $\theta = 0$ three episodes go Right, Left, Right. REINFORCE averages return times
+# score and takes a step of rate 0.1.
+
+# %%
+p = 0.5
+scores = np.array([1 - p, -p, 1 - p])
+returns = np.array([5, -1, 5])
+gradient = (returns * scores).mean()
+theta = 0 + 0.1 * gradient
+print(f"gradient {gradient:.2f}, θ: 0 → {theta:.3f}, π(Right): 0.5 → {1 / (1 + np.exp(-theta)):.3f}")
+assert round(theta, 3) == 0.183
+
+# %% [markdown]
+# ## By the package
+#
+# The same problem as an environment, with a policy that is linear in an observation that is always 1. Its parameters
+# are a weight and a bias for the logit of each action. From the same three episodes, the gradient of the weight of
+# Right is the one above.
+
+
+# %%
+class OneStep(gym.Env):
+    """Each action has its reward, and then the episode is over."""
+
+    observation_space = spaces.Box(1, 1, (1,))
+
+    def __init__(self, *rewards):
+        self.rewards = rewards
+        self.action_space = spaces.Discrete(len(rewards))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        return np.ones(1, dtype=np.float32), self.rewards[action], True, False, {}
+
+
+def make_model(*rewards):
+    """A uniform policy, and stochastic gradient ascent."""
+    policy_kwargs = {"net_arch": [], "optimizer_class": th.optim.SGD}
+    arguments = {"baseline": "none", "n_episodes": 3, "learning_rate": 0.1, "max_grad_norm": None}
+    model = REINFORCE("MlpPolicy", OneStep(*rewards), policy_kwargs=policy_kwargs, device="cpu", seed=seed, **arguments)
+    for parameter in model.policy.action_net.parameters():
+        th.nn.init.zeros_(parameter)
+    return model
+
+
+model = make_model(-1.0, 5.0)
+rollout = replace(
+    sample(model, 3),
+    actions=th.tensor([1.0, 0.0, 1.0]).reshape(3, 1, 1),
+    returns=th.tensor([[5.0], [-1.0], [5.0]], dtype=th.float64),
+)
+(by_episode,) = gradients_by_episode(rollout, rollout.returns)
+print("gradient of the weights of Left and Right:", by_episode.mean(0)[:2].tolist())
+assert abs(by_episode.mean(0)[1] - gradient) < 1e-6
+
+# %% [markdown]
+# `learn` draws its own three episodes, and moves the weight by 0.1 times their gradient.
+
+# %%
+model.learn(1)
+is_right = model.rollout.actions.flatten()
+expected = 0.1 * (model.rollout.returns.flatten() * (is_right - 0.5)).mean()
+print(f"drawn {is_right.int().tolist()}, weight of Right: 0 → {model.policy.action_net.weight[1].item():.3f}")
+assert abs(model.policy.action_net.weight[1].item() - expected) < 1e-6
+
+# %% [markdown]
+# ## The score has mean zero
+#
+# $E_{a \sim \pi}[\nabla \log \pi(a)] = 0$ for every policy. So a constant that is subtracted from all returns leaves
+# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$ and the mean is a sum; for
+# a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero up to its standard
+# error.
+
+# %%
+probabilities = th.softmax(th.randn(4), dim=0)
+softmax_scores = th.eye(4) - probabilities
+gaussian_scores = (th.normal(0.7, 1.5, (100_000,)) - 0.7) / 1.5**2
+standard_error = gaussian_scores.std() / 100_000**0.5
+print("softmax: ", (probabilities @ softmax_scores).abs().max().item())
+print(f"Gaussian: {gaussian_scores.mean():.4f}, standard error {standard_error:.4f}")
+assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.mean().abs() < 4.5 * standard_error
+
+# %% [markdown]
+# ## When all returns are positive
+#
+# Three actions with returns 8, 10 and 12. Without a baseline every drawn action is made more likely, only by different
+# amounts. With the mean of the batch the average action is left alone. The mean contains the return that it is
+# subtracted from, which makes the gradient too small by a factor $(N - 1) / N$; the mean of the *other* episodes does
+# not.
+
+# %%
+rollout = replace(sample(make_model(8.0, 10.0, 12.0), 3), returns=th.tensor([[8.0], [10.0], [12.0]], dtype=th.float64))
+print("no baseline:  ", rollout.returns.flatten().tolist())
+print("mean:         ", (rollout.returns - mean(rollout)).flatten().tolist())
+print("leave one out:", (rollout.returns - leave_one_out(rollout)).flatten().tolist())
+assert (rollout.returns - mean(rollout)).flatten().tolist() == [-2, 0, 2]
+
+# %% [markdown]
+# Both gradients have the same mean. But if every drawn action gains, then most of a gradient tells which actions
+# happened to be drawn. Over the three equally likely episodes the variance can be computed exactly:
+
+# %%
+scores = np.eye(3) - 1 / 3
+returns = np.array([8.0, 10.0, 12.0])
+none, centred = ((returns - baseline)[:, None] * scores for baseline in (0.0, 10.0))
+for name, gradients in (("no baseline", none), ("baseline 10", centred)):
+    print(f"{name}: mean {gradients.mean(0).round(3)}, variance {gradients.var(0).sum():.2f}")
+assert np.allclose(none.mean(0), centred.mean(0)) and none.var(0).sum() > 70 * centred.var(0).sum()

@@ -1,0 +1,130 @@
+# %% [markdown]
+# # Which baseline leaves the least noise?
+#
+# A baseline $b_t$ is subtracted from the return before it weighs the score. It leaves the expected gradient alone as
+# long as it does not depend on the action. How much noise it removes depends on what it may depend on: nothing, the
+# time, or the state.
+
+# %%
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import compare_baselines, gradients_by_episode, sample
+from sb3_reinforce.diagnostics.plots import plot_baselines
+from sb3_reinforce.estimation import BASELINES
+
+seed = 0
+th.set_num_threads(1)
+
+# %% [markdown]
+# ## A bandit
+#
+# Two actions with rewards from $N(3, 4)$ and $N(5, 4)$, and gradients of 20 rollouts. Here every variance has a
+# formula. The optimal baseline is the constant of least variance, the mean of the returns weighted by the squared
+# length of their scores. For a uniform policy all scores have one length, and it is the mean of the returns. For a
+# policy that prefers an action it is better than the mean.
+
+
+# %%
+class Bandit(gym.Env):
+    """The observation is always 1, and an episode is one step."""
+
+    observation_space, action_space = spaces.Box(1, 1, (1,)), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        return np.ones(1, dtype=np.float32), self.np_random.normal([3.0, 5.0][action], 2.0), True, False, {}
+
+
+policy_kwargs = {"net_arch": []}
+bandit = make_vec_env(Bandit, 50, seed=seed)
+model = REINFORCE("MlpPolicy", bandit, baseline="none", policy_kwargs=policy_kwargs, seed=seed, device="cpu")
+th.nn.init.zeros_(model.policy.action_net.weight)
+names = ("none", "mean", "optimal")
+
+figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.6), sharey=True, layout="constrained")
+for ax, p in zip(axes, (0.5, 0.8), strict=True):
+    model.policy.action_net.bias.data = th.tensor([1 - p, p]).log()
+    pq = p * (1 - p)
+    exact = [(4 * pq * (13 * p + 29 * (1 - p)) - 16 * pq**2) / 20, 16 * pq * (2 - 4 * pq) / 20, 16 * pq / 20]
+    rollout = sample(model, 10_000)
+    measured = []
+    for name, truth in zip(names, exact, strict=True):
+        # A sample of the variance of 20 rollouts is the variance of one, divided by 20
+        (gradients,) = gradients_by_episode(rollout, rollout.returns - BASELINES[name](rollout))
+        measured.append(gradients.var(0).sum().item() / 20)
+        print(f"p = {p}, {name:8s} variance {measured[-1]:.3f}, exact {truth:.3f}")
+    assert np.allclose(measured, exact, rtol=0.08)
+    ax.bar(names, measured, color="#56B4E9", label="10,000 rollouts")
+    ax.plot(exact, linestyle="", marker="D", color="#D55E00", label="exact")
+    ax.set(title=f"better action with probability {p}", xlabel="baseline")
+axes[0].set_ylabel("variance of the gradient of 20 rollouts")
+axes[1].legend(frameon=False)
+plt.show()
+
+# %% [markdown]
+# ## CartPole
+#
+# Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
+# baseline on the same 200 episodes. The ratio compares a baseline with "none" on the same resamples, so its interval is
+# much narrower than the intervals of the two variances.
+
+# %%
+env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
+policy_kwargs = {"net_arch": {"pi": [], "vf": [64]}}
+model = REINFORCE(
+    "MlpPolicy", env, critic_learning_rate=0.01, policy_kwargs=policy_kwargs, seed=seed, device="cpu"
+).learn(10_000)
+table = compare_baselines(model, n_episodes=200, seed=seed)
+print(table)
+plot_baselines(table)
+plt.show()
+
+# %% [markdown]
+# "optimal" is only the best *constant*; "time_mean" and "leave_one_out" depend on the step, "value" on the state. Which
+# is best depends on the task. Here it is often the constant: long episodes have long scores, and the constant gives
+# them more weight. Hollow markers are biased: "time_mean" contains the return that it is subtracted from, and so
+# shrinks the gradient of $N$ episodes of one length to $(N - 1) / N$, noise included. "leave_one_out" is the same
+# without that bias. The floor takes the best constant for each single component of the gradient.
+
+# %%
+ratio = {row.baseline: row.ratio.value for row in table}
+assert ratio["optimal"] < 0.8 and ratio["floor"] < ratio["optimal"] and ratio["value"] < ratio["none"]
+
+# %% [markdown]
+# ## When the best constant is a bad baseline
+#
+# Twenty steps that earn 1 each, whatever is done: the return falls from 20 to 1, and no constant follows it. The mean
+# of the other episodes at the same step removes all noise.
+
+
+# %%
+class Countdown(gym.Env):
+    """The observation is the fraction of the time that is over."""
+
+    observation_space, action_space = spaces.Box(0, 1, (1,)), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.full(1, self.t / 20, dtype=np.float32), 1.0, self.t == 20, False, {}
+
+
+env = make_vec_env(Countdown, 8, seed=seed)
+model = REINFORCE("MlpPolicy", env, baseline="none", gamma=1.0, seed=seed, device="cpu")
+table = compare_baselines(model, 200, ("optimal", "leave_one_out"), seed=seed)
+for row in table:
+    print(f"{row.baseline:14s} variance / variance of none {row.ratio}")
+assert table["optimal"].ratio.value > 0.1 and table["leave_one_out"].ratio.value < 1e-6

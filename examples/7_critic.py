@@ -1,0 +1,72 @@
+# %% [markdown]
+# # How far should a critic be trusted?
+#
+# A critic $V(s)$ can do more than serve as a baseline: it can stand in for the rewards that are still to come. With
+# $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$ the generalized advantage estimate is $\sum_k (\gamma \lambda)^k
+# \delta_{t+k}$ (Schulman et al., 2016). At $\lambda = 1$ it is the return less the baseline: unbiased, however wrong
+# $V$ is. At $\lambda = 0$ only $\delta_t$ is left: little noise, and all errors of $V$.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import gradient_statistics, gradients_by_episode, sample
+from sb3_reinforce.estimation import lambda_return
+
+seed = 0
+th.set_num_threads(1)
+
+# %% [markdown]
+# The policy stays as it is (`learning_rate=0`), only its critic learns. The gradient of each $\lambda$ is computed from
+# the same 300 episodes, once before the critic has learned and once after.
+
+# %%
+env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
+model = REINFORCE(
+    "MlpPolicy", env, learning_rate=0.0, critic_learning_rate=5e-3, n_critic_updates=10, seed=seed, device="cpu"
+)
+lambdas = (0.0, 0.5, 0.8, 0.95, 1.0)
+
+
+def bias_and_noise(n_episodes=300):
+    """The bias of each λ, as a share of the gradient, and the standard deviation of a gradient of 16 episodes."""
+    rollout = sample(model, n_episodes)
+    arrays = [part.numpy() for part in (rollout.rewards, rollout.dones, rollout.next_values)]
+    weights = [th.as_tensor(lambda_return(*arrays, model.gamma, each)) - rollout.values for each in lambdas]
+    gradients = gradients_by_episode(rollout, *weights)
+    norm = gradients[-1].mean(0).norm().item()
+    bias = [(each - gradients[-1]).mean(0).norm().item() / norm for each in gradients]
+    noise = [(gradient_statistics(each).variance.value / 16) ** 0.5 / norm for each in gradients]
+    return np.array(bias), np.array(noise)
+
+
+found = {"untrained critic": bias_and_noise()}
+model.learn(30_000)
+found["trained critic"] = bias_and_noise()
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.4), sharex=True, layout="constrained")
+for (name, pair), colour in zip(found.items(), ("#D55E00", "#0072B2"), strict=True):
+    for ax, values in zip(axes, pair, strict=True):
+        ax.plot(lambdas, values, marker="o", color=colour, label=name)
+    print(name)
+    for each, bias, noise in zip(lambdas, *pair, strict=True):
+        print(f"  λ = {each:4.2f}: bias {bias:4.2f}, noise {noise:5.2f}, both {np.hypot(bias, noise):5.2f}")
+axes[0].set(title="bias", xlabel="λ", ylabel="share of the gradient's norm", ylim=(0, None))
+axes[1].set(title="noise of 16 episodes", xlabel="λ", ylim=(0, None))
+axes[0].legend(frameon=False)
+plt.show()
+
+# %% [markdown]
+# An untrained critic says nothing of the future, so $\lambda = 0$ loses most of the gradient. A trained one gives
+# almost the same direction with far less noise. The usual $\lambda = 0.95$ is in between. At $\lambda = 1$ a wrong
+# critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
+
+# %%
+(bias_before, noise_before), (bias_after, noise_after) = found.values()
+assert noise_before[0] < noise_before[-1] and noise_after[0] < noise_after[-1]
+assert bias_before[0] > bias_before[3] > bias_before[-1] == 0
+assert bias_after[0] < bias_before[0]

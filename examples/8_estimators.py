@@ -1,0 +1,101 @@
+# %% [markdown]
+# # Where do the estimators point?
+#
+# The likelihood ratio and the finite differences estimate one and the same gradient. First: is it right? Then: which of
+# them sees it from the fewest steps? Last, a picture.
+
+# %%
+import matplotlib.pyplot as plt
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import (
+    CandidateUtility,
+    check_gradient,
+    compare_estimators,
+    gradients_by_episode,
+    landscape,
+    sample,
+)
+from sb3_reinforce.diagnostics.plots import plot_landscape
+from sb3_reinforce.estimation import BASELINES, regression_gradient
+
+seed = 0
+th.set_num_threads(1)
+
+# %%
+env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
+policy_kwargs = {"net_arch": {"pi": [], "vf": [64]}}
+model = REINFORCE("MlpPolicy", env, gamma=1.0, seed=seed, device="cpu", policy_kwargs=policy_kwargs)
+model.learn(5_000)
+
+# %% [markdown]
+# ## The checklist
+#
+# If a policy does not learn, check the gradient before anything else: the score against finite differences of $\log
+# \pi$, its sign, the returns, the weights, and the step that `train()` takes.
+
+# %%
+check = check_gradient(model)
+print(check)
+assert check.passed
+
+# %% [markdown]
+# ## Signal from a step
+#
+# One estimate is one episode for the likelihood ratio. For the others it is one episode for each perturbed policy. The
+# cosine is the one of the *expected* estimate to the gradient; the signal-to-noise ratio is divided by the steps.
+
+# %%
+table = compare_estimators(model, n_episodes=200, n_estimates=20, seed=seed)
+print(table)
+by_name = {row.estimator: row.snr_per_step.value for row in table}
+assert by_name["likelihood_ratio"] == max(by_name.values())
+
+# %% [markdown]
+# Rules of thumb: a regression up to about 20 parameters, central differences from 20 to 500, and the likelihood ratio
+# wherever the policy can be differentiated.
+#
+# ## A picture
+#
+# $U(\theta)$ on a plane through $\theta$: along the gradient of 1000 episodes, and along a random direction. A single
+# estimate is one draw, so twelve of each are drawn. The width of a fan is the noise.
+
+
+# %%
+def likelihood_ratio(baseline, n_episodes):
+    """The gradient of some episodes."""
+    rollout = sample(model, n_episodes)
+    (gradients,) = gradients_by_episode(rollout, rollout.returns - BASELINES[baseline](rollout))
+    return gradients.mean(0).double()
+
+
+utility = CandidateUtility(model, 1, seed)
+n = len(utility.theta)
+
+
+def regression(n_delta):
+    """A finite-difference regression, with one episode for each perturbed policy."""
+    return regression_gradient(utility, utility.theta, 0.3 * th.randn(n_delta, n, dtype=th.float64))
+
+
+truth = likelihood_ratio("value", 1000)
+fans = {
+    "REINFORCE, no baseline, 10 episodes": [likelihood_ratio("none", 10) for _ in range(12)],
+    "REINFORCE, critic, 10 episodes": [likelihood_ratio("value", 10) for _ in range(12)],
+    "regression, 20 perturbations": [regression(20) for _ in range(12)],
+    "regression, 200 perturbations": [regression(200) for _ in range(12)],
+}
+fans = {name: th.stack(fan) for name, fan in fans.items()}
+cosines = {name: th.cosine_similarity(fan, truth[None]).mean().item() for name, fan in fans.items()}
+for name, cosine in cosines.items():
+    print(f"{name:38s} mean cosine to the gradient {cosine:+.2f}")
+few, many = (cosines[f"regression, {n_delta} perturbations"] for n_delta in (20, 200))
+assert few + 0.15 < many and many > 0.6
+
+# %%
+plane = th.stack([truth, th.randn(n, dtype=th.float64)])
+found = landscape(model, fans, plane, extent=8.0, n_points=9, n_episodes=12, seed=seed)
+plot_landscape(found)
+plt.show()

@@ -1,0 +1,125 @@
+# %% [markdown]
+# # How large may a step be?
+#
+# A noisy gradient is right on average. So is noise only a matter of patience? No: a policy acts on what it has learned,
+# and a step that was too large in the wrong direction may never be taken back. Less noise allows larger steps.
+
+# %%
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import GradientQualityCallback
+
+seed = 0
+th.set_num_threads(1)
+generator = np.random.default_rng(seed)
+
+# %% [markdown]
+# ## A thousand runs of two actions
+#
+# Left earns 8 and Right 12; $\pi(\text{Right}) = \sigma(\theta)$, starting from $\theta = 0$. Every return is positive,
+# so without a baseline each drawn action is made more likely. A run that draws Left often at first may never see Right
+# again. The baseline is the mean of the other episodes of the update.
+
+
+# %%
+def climb(rate, n_episodes, with_baseline, n_updates=200, n_runs=1000):
+    """The mean of π(Right) over the runs after each update."""
+    theta, means = np.zeros((n_runs, 1)), []
+    for _ in range(n_updates):
+        p = 1 / (1 + np.exp(-theta))
+        right = generator.random((n_runs, n_episodes)) < p
+        returns = np.where(right, 12.0, 8.0)
+        if with_baseline:
+            returns = returns - (returns.sum(1, keepdims=True) - returns) / (n_episodes - 1)
+        theta = theta + rate * (returns * (right - p)).mean(1, keepdims=True)
+        means.append(p.mean())
+    return np.array(means)
+
+
+settings = {
+    "rate 0.5, 1 episode": (0.5, 1, False),
+    "rate 0.01, 1 episode": (0.01, 1, False),
+    "rate 4, 20 episodes": (4.0, 20, False),
+    "rate 4, 20 episodes, baseline": (4.0, 20, True),
+}
+curves = {name: climb(*setting) for name, setting in settings.items()}
+figure, ax = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+for (name, curve), colour in zip(curves.items(), ("#D55E00", "#E69F00", "#56B4E9", "#0072B2"), strict=True):
+    ax.plot(curve, color=colour, label=name)
+    print(f"{name:32s} π(Right) after 20 updates {curve[20]:.3f}, after 200 {curve[-1]:.3f}")
+ax.set(title="Mean of 1000 runs", xlabel="update", ylabel="π(Right)", ylim=(0.4, 1.02))
+ax.legend(frameon=False, fontsize="small")
+plt.show()
+large, small, batch, baseline = curves.values()
+assert large[-1] < 0.9 and batch[-1] < 0.99 and baseline[-1] > 0.995
+assert baseline[20] > small[20] + 0.2
+
+# %% [markdown]
+# The large step with one episode ends on the wrong action in many runs. The small step gets there, slowly. Twenty
+# episodes allow a step eight times as large, and three runs in a hundred are lost. With a baseline none is. For a
+# gradient with the standard deviation $\sigma_g$ and $T$ updates, theory recommends a rate of about $1 / (\sigma_g
+# \sqrt T)$.
+#
+# ## How noisy is the gradient of a real run?
+#
+# `GradientQualityCallback` logs `gradient/noise_scale`, the number of episodes with a signal-to-noise ratio of 1. It
+# grows as the policy improves: what is left to learn is smaller than the noise.
+
+
+# %%
+class Print(GradientQualityCallback):
+    """Prints the noise scale that it logs."""
+
+    def measure(self, rollout):
+        figures = super().measure(rollout)
+        print(f"{self.num_timesteps:6,} steps: noise scale {figures['noise_scale']:6.1f} episodes")
+        return figures
+
+
+env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
+model = REINFORCE(
+    "MlpPolicy", env, baseline="leave_one_out", n_episodes=32, learning_rate=0.01, seed=seed, device="cpu"
+)
+model.learn(15_000, callback=Print(every=3), log_interval=None)
+
+# %% [markdown]
+# ## Two guards
+#
+# `max_grad_norm` bounds the length of a step, so one unlucky batch cannot undo what was learned.
+# `normalize_advantage=True` scales the weights of a batch to mean 0 and standard deviation 1. Then rewards that are 100
+# times as large make the same step:
+
+
+# %%
+class Scaled(gym.Env):
+    """Two actions, worth 0 and ``scale``."""
+
+    observation_space, action_space = spaces.Box(1, 1, (1,)), spaces.Discrete(2)
+
+    def __init__(self, scale):
+        self.scale = scale
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(1, dtype=np.float32), {}
+
+    def step(self, action):
+        return np.ones(1, dtype=np.float32), self.scale * float(action), True, False, {}
+
+
+arguments = {"baseline": "none", "n_episodes": 20, "max_grad_norm": None, "device": "cpu", "seed": seed}
+arguments["policy_kwargs"] = {"net_arch": [], "optimizer_class": th.optim.SGD}
+for normalize in (False, True):
+    steps = []
+    for scale in (1.0, 100.0):
+        model = REINFORCE("MlpPolicy", Scaled(scale), normalize_advantage=normalize, **arguments)
+        before = model.policy.action_net.bias.detach().clone()
+        steps.append((model.learn(1).policy.action_net.bias.detach() - before).norm().item())
+    print(f"normalize_advantage={normalize}: lengths of the steps {steps[0]:.6f} and {steps[1]:.6f}")
+    assert np.isclose(steps[1] / steps[0], 1 if normalize else 100, rtol=0.01)

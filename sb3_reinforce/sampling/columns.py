@@ -1,0 +1,79 @@
+"""The columns of a rollout, one per environment, which several processes may have collected."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from sb3_reinforce.common.tensors import take
+from sb3_reinforce.estimation.returns import Integers
+from sb3_reinforce.sampling.collection import ROWS, Bools, TerminalObs
+
+
+@dataclass(frozen=True)
+class Columns:
+    """
+    What was collected besides the rows of the buffer; ``dones`` is of shape ``(n_steps, n_envs)``.
+
+    ``quota`` is the number of episodes that count in each environment; ``state`` is as in ``Rollout``.
+    """
+
+    dones: Bools
+    terminal_obs: TerminalObs
+    last_obs: Any
+    quota: Integers
+    state: th.Tensor | None = None
+
+
+def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | None:
+    """In process 0 the columns of all processes, also in the buffer; elsewhere None, after its own are sent."""
+    if model._processes is None:
+        return columns
+    state = None if columns.state is None else columns.state.cpu()
+    parts = model.end_round((replace(columns, state=state), {name: getattr(buffer, name) for name in ROWS}))
+    return join(buffer, parts, model.device) if parts else None
+
+
+def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]], device: Any = "cpu") -> Columns:
+    """Write the parts side by side into the buffer, as one process would with the environments of all."""
+    all_columns = [columns for columns, _ in parts]
+    # A process without a quota has waited for the end of an episode that does not count
+    n_steps = max(len(columns.dones) for columns in all_columns if columns.quota.any())
+    for name in ROWS:
+        # A policy may refuse observations of zeros
+        mode = "edge" if name == "observations" else "constant"
+        setattr(buffer, name, side_by_side([rows[name] for _, rows in parts], n_steps, mode))
+    buffer.n_envs = buffer.rewards.shape[1]
+    buffer.buffer_size = n_steps
+    buffer.pos = n_steps
+    first = np.cumsum([0, *(len(columns.quota) for columns in all_columns)]).tolist()
+    terminal_obs = [
+        ((step, first[number] + env), obs)
+        for number, columns in enumerate(all_columns)
+        for (step, env), obs in columns.terminal_obs.items()
+    ]
+    states = [columns.state for columns in all_columns if columns.state is not None]
+    # A process whose environments all start episodes has none
+    state = [th.zeros_like(states[0]) if columns.state is None else columns.state for columns in all_columns if states]
+    return Columns(
+        # An episode that ends behind the quota does not count, and the padding ends none
+        dones=side_by_side([columns.dones for columns in all_columns], n_steps),
+        # In the order of one process: the last bit of a batch's values may depend on it
+        terminal_obs=dict(sorted(terminal_obs, key=lambda item: item[0])),
+        last_obs=take(side_by_side([take(columns.last_obs, None) for columns in all_columns], 1), 0),
+        quota=np.concatenate([columns.quota for columns in all_columns]),
+        state=th.cat(state).to(device) if state else None,
+    )
+
+
+def side_by_side(arrays: Sequence[Any], n_steps: int, mode: Any = "constant") -> Any:
+    """Arrays, or dicts of arrays, along the axis of the environments, cut or padded to ``n_steps`` rows."""
+    if isinstance(arrays[0], dict):
+        return {key: side_by_side([part[key] for part in arrays], n_steps, mode) for key in arrays[0]}
+    columns = [rows[:n_steps] for rows in arrays]
+    return np.concatenate(
+        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)], mode) for rows in columns], axis=1
+    )

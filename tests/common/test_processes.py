@@ -1,0 +1,358 @@
+"""W processes of n environments are one process with W·n: the same parameters, steps, logs, and ends."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from functools import partial
+
+import enumeration
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from callbacks import At, Record
+from environments import Corridor
+from models import KINDS, Scaled, make, plain
+from processes import ActAsRecorded, RecordRollouts, Replay, in_processes, logged
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_reinforce.common import processes
+from sb3_reinforce.common.distribution import seen_since
+from sb3_reinforce.common.processes import ProcessError, Processes
+from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.recurrent import RecurrentREINFORCE
+from sb3_reinforce.sampling.collection import ROWS
+from sb3_reinforce.sampling.columns import Columns, join
+
+SEARCHES = {
+    "central": {"estimator": "central", "n_delta": 3},
+    "two utilities": {"estimator": "forward", "n_delta": 5, "perturbation": "coordinate"},
+    "regression": {"estimator": "regression", "n_delta": 40, "n_eval_episodes": 2},
+}
+
+
+def search(rank, n_envs, n_updates, names):
+    answers = {}
+    for name in names:
+        env = make_vec_env("CartPole-v1", n_envs)
+        model = make("search", env, seed=5, **{**SEARCHES[name], "common_random_numbers": True})
+        model.learn(10**6, lambda values, _, model=model: model._n_updates < n_updates)
+        answers[name] = plain(model.theta), model._n_updates, len(model.ep_info_buffer)
+    return answers
+
+
+@pytest.mark.parametrize(
+    ("n_updates", "names", "sizes"),
+    [(3, SEARCHES, (2,)), pytest.param(50, ("central", "two utilities"), (2, 4), marks=pytest.mark.slow)],
+)
+def test_finite_difference_has_the_same_parameters_bit_for_bit(n_updates, names, sizes, tmp_path):
+    alone = search(0, 4, n_updates, names)
+    for size in sizes:
+        task = partial(search, n_envs=4 // size, n_updates=n_updates, names=names)
+        first, *others = in_processes(size, task, tmp_path)
+        assert first == alone
+        assert all(other[name][:2] == first[name][:2] for other in others for name in names)
+
+
+EXTENTS = {"steps": {"n_steps": 12}, "episodes": {"n_steps": None, "n_episodes": 7}}
+MEMORY = {"baseline": "value", "policy_kwargs": {"lstm_hidden_size": 4, "net_arch": [4]}}
+SHARED_EXTRACTOR = {"net_arch": [4], "features_extractor_class": Scaled}
+ROLLOUTS = {f"{name} {extent}": {"baseline": name, **EXTENTS[extent]} for name in BASELINES for extent in EXTENTS} | {
+    "shared extractor": {"policy_kwargs": SHARED_EXTRACTOR},
+    "total return": {"baseline": "mean", "reward_to_go": False, **EXTENTS["steps"]},
+    "normalized": {"normalize_advantage": True, "normalize_by": "episodes", **EXTENTS["episodes"]},
+    "schedules": {"temperature": lambda left: 1 + left, "learning_rate": lambda left: 0.01 * left},
+    "fewer episodes than processes": {"n_steps": None, "n_episodes": 1},
+    "recurrent episodes": {"n_episodes": 7, **MEMORY},
+    "recurrent steps": {"n_steps": 5, **MEMORY},
+}
+WRAPPERS = {"normalized": VecNormalize, "schedules": VecNormalize}
+
+
+def corridors(n_envs, lengths=(2, 3, 4), reward=lambda t, action: float(action) - t, **kwargs):
+    return make_vec_env(lambda: Corridor(lengths, reward, **kwargs), n_envs)
+
+
+def build(name, env):
+    kwargs = {"seed": 1, "device": "cpu", **ROLLOUTS[name]}
+    if name.startswith("recurrent"):
+        return RecurrentREINFORCE("MlpLstmPolicy", env, **kwargs)
+    return make("steps", env if isinstance(env, Replay) else WRAPPERS.get(name, lambda env: env)(env), **kwargs)
+
+
+def learn_all(rank):
+    """The rollouts and last states of all models, in this process."""
+    answers = {}
+    for name in ROLLOUTS:
+        model = build(name, corridors(2, truncate=True))
+        callback = RecordRollouts()
+        model.learn(60, callback)
+        answers[name] = model.get_parameters(), logged(model), model.num_timesteps, callback.rollouts
+    return answers
+
+
+@pytest.fixture(scope="module")
+def of_two_processes(tmp_path_factory):
+    return in_processes(2, learn_all, tmp_path_factory.mktemp("group"))
+
+
+@pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
+@pytest.mark.parametrize("name", ROLLOUTS)
+def test_reinforce_is_one_process_that_collects_the_same_rollouts(name, of_two_processes):
+    parameters, log, num_timesteps, rollouts = of_two_processes[0][name]
+    model = build(name, corridors(2, truncate=True))
+    model = build(name, Replay(model, rollouts, starts_over=model.n_episodes is not None))
+    callback = ActAsRecorded(rollouts)
+    # Processes that have played their episodes make fewer steps than the environments of one process
+    model.learn(60 if model.n_steps else 10**6, callback)
+    if name == "recurrent steps":
+        # The states that are carried on have been computed for two environments at once, and for four
+        for key, expected in parameters["policy"].items():
+            th.testing.assert_close(model.policy.state_dict()[key], expected, rtol=0, atol=1e-6)
+    else:
+        assert plain(model.get_parameters()) == plain(parameters) and logged(model) == log
+        assert [rollout.log for rollout in callback.rollouts] == [rollout.log for rollout in rollouts]
+    assert len(rollouts) > 1 and 60 <= num_timesteps <= model.num_timesteps
+    # Callbacks of process 0 only, and its policy in both
+    assert not of_two_processes[1][name][-1]
+    assert plain(of_two_processes[1][name][0]["policy"]) == plain(parameters["policy"])
+
+
+@pytest.mark.parametrize("baseline", ["none", "leave_one_out"])
+def test_the_expected_gradient_of_two_processes_is_exact(baseline, monkeypatch):
+    """Each process plays one episode; the shorter one is padded."""
+    fill = enumeration.fill
+
+    def fill_in_parts(model, batch):
+        parts = []
+        for episode in batch:
+            buffer, dones = fill(model, [episode])
+            columns = Columns(dones, {}, buffer.observations[-1], np.ones(1, dtype=int))
+            parts.append((columns, {name: getattr(buffer, name) for name in ROWS}))
+        return buffer, join(buffer, parts).dones
+
+    model = enumeration.make_model(ragged=True, baseline=baseline)
+    monkeypatch.setattr(enumeration, "fill", fill_in_parts)
+    enumeration.assert_equal(enumeration.expected_gradient(model), enumeration.gradient_of_return(model))
+
+
+def of_the_union(rank, n_envs=2):
+    """In a task whose observations and rewards do not depend on the actions, and in one that is not seeded."""
+    env = VecNormalize(corridors(n_envs, (3,), lambda t, action: float(t)))
+    model = make("steps", env, seed=10, n_steps=3)
+    model.learn(60)
+    model.learn(60, reset_num_timesteps=False)
+    moments = [(rms.mean, rms.var, rms.count) for rms in (env.obs_rms, env.ret_rms)]
+    th.manual_seed(0)
+    unseeded = make("steps", corridors(n_envs))
+    unseeded.learn(16)
+    seeds = env.get_attr("np_random_seed"), unseeded.env.get_attr("np_random_seed")
+    wait_fraction = model.logger.name_to_value.get("time/wait_fraction")
+    return model.num_timesteps, len(model.ep_info_buffer), moments, *seeds, th.rand(1).item(), wait_fraction
+
+
+def test_seeds_steps_episodes_and_moments_are_those_of_one_process(tmp_path):
+    n_steps, n_episodes, moments, seeds, *_ = of_the_union(0, 4)
+    first, second = in_processes(2, of_the_union, tmp_path)
+    assert first[0] == second[0] == n_steps == 120
+    assert first[1] == n_episodes == 40
+    assert first[3] + second[3] == seeds == [10, 11, 12, 13]
+    for expected, found, same in zip(moments, first[2], second[2], strict=True):
+        for value, one, other in zip(expected, found, same, strict=True):
+            assert np.allclose(one, value, rtol=1e-9, atol=0) and np.array_equal(one, other)
+    assert {*first[4]}.isdisjoint(second[4]) and first[5] != second[5]
+    assert 0 < first[6] < 1
+
+
+def test_moments_seen_since_are_exact_far_from_zero():
+    data = np.random.default_rng(0).normal(1e4, 1.0, (5000, 3))
+    after = RunningMeanStd(shape=(3,))
+    after.update(data[:4000])
+    before = after.copy()
+    after.update(data[4000:])
+    seen = seen_since(before, after)
+    assert seen.count == 1000
+    assert np.allclose(seen.mean, data[4000:].mean(0), rtol=1e-9)
+    assert np.allclose(seen.var, data[4000:].var(0), rtol=1e-6)
+
+
+class Acts(gym.Wrapper):
+    """Calls a function in its 30th step."""
+
+    def __init__(self, env, act):
+        super().__init__(env)
+        self.act = act
+        self.n_steps = 0
+
+    def step(self, action):
+        self.n_steps += 1
+        if self.n_steps == 30:
+            self.act()
+        return super().step(action)
+
+
+def fail(*_):
+    raise OSError("broken")
+
+
+def send(number, *_):
+    os.kill(os.getpid(), number)
+
+
+def named(rank, error):
+    return ProcessError(f"Process {rank} of 2 has stopped: {error}")
+
+
+DEAD = ProcessError("Process 1 of 2 has died, or ended without a message")
+INTERRUPTED = "KeyboardInterrupt"
+# What happens in which process, the errors of both, and with which kinds of updates
+STOPS = {
+    "callback returns False": (0, "callback", lambda model: False, (None, None), KINDS),
+    "callback raises": (0, "callback", fail, (OSError("broken"), named(0, "OSError: broken")), ["steps"]),
+    "environment raises": (1, "step", fail, (named(1, "OSError: broken"), OSError("broken")), KINDS),
+    "SIGINT": (1, "step", partial(send, signal.SIGINT), (named(1, INTERRUPTED), KeyboardInterrupt()), ["steps"]),
+    "SIGTERM": (0, "step", partial(send, signal.SIGTERM), (KeyboardInterrupt(), named(0, INTERRUPTED)), ["search"]),
+    "SIGKILL": (1, "step", partial(send, signal.SIGKILL), (DEAD, None), ["steps", "search"]),
+}  # fmt: skip
+
+
+def stop(rank, kind, name, folder):
+    where, how, act, *_ = STOPS[name]
+    env = make_vec_env(lambda: Acts(Corridor((3,)), act if (rank, how) == (where, "step") else lambda: None), 1)
+    model = make(kind, env, seed=0, **({"n_episodes": 8} if kind == "episodes" else {}))
+    error = None
+    try:
+        model.learn(10**6, At(30, act) if how == "callback" else None)
+    except BaseException as raised:
+        error = raised
+    policy = plain(model.policy.state_dict())
+    model.save(folder / f"model_{rank}")
+    # Alone
+    os.environ["SB3_REINFORCE_PROCESSES"] = "0"
+    model.learn(20, reset_num_timesteps=False)
+    return repr(error), model._n_updates > 0, policy
+
+
+@pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, values in STOPS.items() for kind in values[-1]])
+def test_an_end_in_one_process_ends_all_and_leaves_the_last_good_model(name, kind, tmp_path):
+    first, second = in_processes(2, partial(stop, kind=kind, name=name, folder=tmp_path), tmp_path)
+    errors = STOPS[name][3]
+    assert first[:2] == (repr(errors[0]), True)
+    assert [path.name for path in tmp_path.glob("model*")] == ["model_0.zip"]
+    assert second is None if name == "SIGKILL" else second[0] == repr(errors[1])
+    # Both have dropped the same rollout
+    assert name != "callback returns False" or first[2] == second[2]
+    loaded = KINDS[kind][0].load(tmp_path / "model_0", env=Corridor((3,)), device="cpu")
+    assert plain(loaded.policy.state_dict()) == first[2]
+    loaded.learn(20)
+
+
+DIFFERENT = {"gamma": "gamma=0.9", "n_envs": "n_envs=1", "policy": "Tanh", "VecNormalize": "VecNormalize=[]"}
+
+
+def differ(rank, name):
+    kwargs = {"gamma": 0.9 + 0.05 * rank} if name == "gamma" else {}
+    if name == "policy":
+        kwargs = {"policy_kwargs": {"activation_fn": [th.nn.Tanh, th.nn.ReLU][rank]}}
+    env = corridors(1 + rank if name == "n_envs" else 1)
+    model = make("steps", VecNormalize(env) if name == "VecNormalize" and rank else env, **kwargs)
+    model.learn(10)
+
+
+@pytest.mark.parametrize("name", DIFFERENT)
+def test_processes_with_other_arguments_are_refused(name, tmp_path):
+    first, second = in_processes(2, partial(differ, name=name), tmp_path)
+    assert isinstance(first, ValueError) and "must be started with the same arguments" in str(first)
+    assert str(first) == str(second) and DIFFERENT[name] in str(second) and "process 1 has" in str(second)
+
+
+def actions_of_all(rank, path):
+    """With restored generators, with the same seed in all, and after a callback has changed the policy."""
+    restored = KINDS["steps"][0].load(path, corridors(1), restore_random_state=True)
+    restored.learn(1)
+    seeded = make("steps", corridors(1), n_steps=32)
+    th.manual_seed(0)
+    seeded.learn(1)
+    changed = make("steps", corridors(1), n_steps=32)
+    always_1 = th.tensor([-50.0, 50.0])
+    changed.learn(128, Record(lambda model: model.policy.action_net.bias.data.copy_(always_1)))
+    return [model.rollout_buffer.actions[..., 0].T for model in (restored, seeded, changed)]
+
+
+def test_processes_draw_other_actions_and_take_over_what_a_callback_changes(tmp_path):
+    make("steps", corridors(1), n_steps=32, seed=0).save(tmp_path / "model")
+    (restored, seeded, changed), _ = in_processes(2, partial(actions_of_all, path=tmp_path / "model"), tmp_path)
+    assert (restored[0] != restored[1]).any() and (seeded[0] != seeded[1]).any() and (changed == 1).all()
+
+
+def returns_in_window(rank):
+    model = make("steps", corridors(2, (3,), lambda t, action: float(rank)), n_steps=3, stats_window_size=2)
+    model.learn(24)
+    return sorted(episode["r"] for episode in model.ep_info_buffer)
+
+
+def test_the_window_of_the_log_has_episodes_of_all_processes(tmp_path):
+    assert in_processes(2, returns_in_window, tmp_path)[0] == [0.0, 3.0]
+
+
+def meet(rank, is_reachable):
+    """A stranger, who sends nothing, connects before process 1."""
+    connect = socket.create_connection
+    strangers = []
+
+    def connect_after_stranger(*arguments):
+        strangers.append(connect(*arguments))
+        if not is_reachable:
+            raise OSError("unreachable")
+        return connect(*arguments)
+
+    socket.create_connection = connect_after_stranger
+    processes.KEY_SECONDS = 0.1
+    if not is_reachable:
+        processes.CONNECT_SECONDS = 1.0
+    with Processes() as group:
+        return group.exchange(rank)
+
+
+def test_process_0_waits_neither_for_strangers_nor_for_ever(tmp_path):
+    assert in_processes(2, partial(meet, is_reachable=True), tmp_path) == [[0, 1], [0, 1]]
+    first, second = in_processes(2, partial(meet, is_reachable=False), tmp_path)
+    assert isinstance(first, ProcessError) and "Process 1 has not connected to localhost:" in str(first)
+    assert repr(second) == repr(OSError("unreachable"))
+
+
+SCRIPT = """
+import os, signal, sys
+import gymnasium as gym
+from sb3_reinforce import REINFORCE, is_leader
+
+class Dies(gym.Wrapper):
+    n_steps = 0
+
+    def step(self, action):
+        self.n_steps += 1
+        if self.n_steps == 100 and not is_leader():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+model = REINFORCE("MlpPolicy", Dies(gym.make("CartPole-v1")), n_steps=16, device="cpu", verbose=1)
+try:
+    model.learn(10**6)
+finally:
+    model.save(sys.argv[1])
+"""
+
+
+def test_torchrun_is_found_and_the_model_is_saved_after_a_process_has_died(tmp_path):
+    (tmp_path / "train.py").write_text(SCRIPT)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    script = [tmp_path / "train.py", tmp_path / "model"]
+    ended = subprocess.run([*command, *script], capture_output=True, text=True, timeout=120)
+    assert f"ProcessError: {DEAD}" in ended.stderr
+    # Only process 0 prints
+    assert ended.stdout.count("Using cpu device") == 1
+    assert KINDS["steps"][0].load(tmp_path / "model.zip")._n_updates == 6
