@@ -200,10 +200,33 @@ def images() -> str:
     return ", ".join(texts)
 
 
+def processes() -> str:
+    """Times the steps a second of one process with as many environments: medians of the rounds."""
+    rows = read("processes")
+    lines = []
+    for milliseconds, same in rows.groupby("milliseconds"):
+        rates = same.pivot_table("rate", "seed", ["kind", "number"])
+        ratios = rates.div(rates["processes", 1], axis=0).median()
+        measured = [f"{ratios[key]:.3g}" for key in [*(("processes", n) for n in (2, 4, 8)), ("SubprocVecEnv", 8)]]
+        computed = same[same["kind"].str.startswith("computed")].set_index("number")["rate"]
+        lines.append([f"{milliseconds:g} ms", *measured, f"{computed[64] / computed[1]:.2g}"])
+    header = ["a step takes", "2 processes", "4", "8", "SubprocVecEnv, 8 workers", "64 processes, 8 machines (computed)"]
+    return markdown(header, lines)
+
+
+def processes_model() -> str:
+    """The rate that the model computes, divided by the median of the measured ones."""
+    rows = read("processes")
+    measured = rows[rows["kind"] == "processes"].groupby(["milliseconds", "number"])["rate"].median()
+    ratios = (rows[rows["kind"] == "model"].set_index(["milliseconds", "number"])["rate"] / measured).unstack()
+    lines = [[f"{ms:g} ms", *(f"{ratio:.2f}" for ratio in row)] for ms, row in ratios.iterrows()]
+    return markdown(["a step takes", *(f"{n} process{'es' * (n > 1)}" for n in ratios)], lines)
+
+
 def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
         comparison, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars, common_random_numbers,
-        search_throughput, throughput, images,
+        search_throughput, throughput, images, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}
