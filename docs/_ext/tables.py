@@ -210,7 +210,7 @@ def processes() -> str:
         measured = [f"{ratios[key]:.3g}" for key in [*(("processes", n) for n in (2, 4, 8)), ("SubprocVecEnv", 8)]]
         computed = same[same["kind"].str.startswith("computed")].set_index("number")["rate"]
         lines.append([f"{milliseconds:g} ms", *measured, f"{computed[64] / computed[1]:.2g}"])
-    header = ["a step takes", "2 processes", "4", "8", "SubprocVecEnv, 8 workers", "64 processes, 8 machines (computed)"]
+    header = ["a step takes", "2 processes", "4", "8", "SubprocVecEnv, 8 workers", "64 processes (computed)"]
     return markdown(header, lines)
 
 
