@@ -297,14 +297,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         callback.on_rollout_start()
         check_starts(self)
         self.start_round()
-        if self.episodes_per_start > 1:
-            self._last_obs = None
-            self._last_obs = start_groups(env, self.episodes_per_start)
-            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-        # A measurement that failed in a callback leaves no observation
-        elif self._last_obs is None or (n_rollout_steps is None and not np.all(self._last_episode_starts)):
-            self._last_obs = env.reset()  # type: ignore[assignment]
-            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        self._start_episodes(env, n_rollout_steps is None)
         if n_rollout_steps is None:
             n_episodes = self.share_of(cast(int, self.n_episodes))
             extent = Extent.whole_episodes(n_episodes, env.num_envs, self.max_episode_steps)
@@ -322,30 +315,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
             own = Columns(dones, terminal_obs, self._last_obs, extent.quota, self._state)
             columns = gather(self, rollout_buffer, own)
-            if columns is None:
-                is_collected = True
-                return True
-            dones = columns.dones
-            self._running = self._running.unless(rollout_buffer.episode_starts[0].astype(bool))
-            next_values = None
-            if route.with_critic:
-                rollout_buffer.values, next_values = self._evaluate_critic(route, rollout_buffer, columns)
-            self.rollout = complete_rollout(
-                rollout_buffer,
-                self.policy,
-                dones,
-                None if n_rollout_steps else columns.quota,
-                self._running,
-                next_values,
-                columns.state,
-                baseline=self._function("baseline", BASELINES),
-                gamma=self.gamma,
-                gae_lambda=self.gae_lambda,
-                reward_to_go=self.reward_to_go,
-                discount_scores=self.discount_scores,
-                normalize_by=self.normalize_by,
-                episodes_per_start=self.episodes_per_start,
-            )
+            if columns is not None:
+                self.rollout = self._complete(rollout_buffer, columns, route, is_fixed=n_rollout_steps is not None)
             is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
@@ -356,13 +327,51 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             if not is_collected:
                 # The environments stopped in the middle of episodes, and are reset before they are used again
                 self._last_obs = None
-        self._running = self._running.after(rollout_buffer.rewards, dones, self.gamma)
-        self.logger.record("rollout/complete_fraction", float(in_finished_episode(dones).mean()))
+        # A process that has sent its part to process 0 has no rollout
+        if columns is None or self.rollout is None:
+            return True
+        self._running = self._running.after(rollout_buffer.rewards, columns.dones, self.gamma)
+        self.logger.record("rollout/complete_fraction", float(in_finished_episode(columns.dones).mean()))
         if n_rollout_steps is None:
             self.logger.record("rollout/used_fraction", float(self.rollout.used.double().mean()))
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
+        """Reset the environments where the next rollout does not continue their episodes."""
+        if self.episodes_per_start > 1:
+            self._last_obs = None
+            self._last_obs = start_groups(env, self.episodes_per_start)
+        # A measurement that failed in a callback leaves no observation
+        elif self._last_obs is None or (are_whole and not np.all(self._last_episode_starts)):
+            self._last_obs = env.reset()  # type: ignore[assignment]
+        else:
+            return
+        self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+
+    def _complete(self, buffer: RolloutBuffer, columns: Columns, route: Route, is_fixed: bool) -> Rollout:
+        """The rollout with the weights of its steps, which the buffer gets too."""
+        self._running = self._running.unless(buffer.episode_starts[0].astype(bool))
+        next_values = None
+        if route.with_critic:
+            buffer.values, next_values = self._evaluate_critic(route, buffer, columns)
+        return complete_rollout(
+            buffer,
+            self.policy,
+            columns.dones,
+            None if is_fixed else columns.quota,
+            self._running,
+            next_values,
+            columns.state,
+            baseline=self._function("baseline", BASELINES),
+            gamma=self.gamma,
+            gae_lambda=self.gae_lambda,
+            reward_to_go=self.reward_to_go,
+            discount_scores=self.discount_scores,
+            normalize_by=self.normalize_by,
+            episodes_per_start=self.episodes_per_start,
+        )
 
     def collect_part(self, callback: BaseCallback) -> None:
         self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
