@@ -56,8 +56,9 @@ for (name, pair), colour in zip(found.items(), ("#D55E00", "#0072B2"), strict=Tr
     for each, bias, noise in zip(lambdas, *pair, strict=True):
         print(f"  λ = {each:4.2f}: bias {bias:4.2f}, noise {noise:5.2f}, both {np.hypot(bias, noise):5.2f}")
 axes[0].set(title="bias", xlabel="λ", ylabel="share of the gradient's norm", ylim=(0, None))
-axes[1].set(title="noise of 16 episodes", xlabel="λ", ylim=(0, None))
+axes[1].set(title="standard deviation of 16 episodes", xlabel="λ", ylim=(0, None))
 axes[0].legend(frameon=False)
+figure.suptitle("CartPole-v1, one policy, gradients of the same 300 episodes", fontsize="medium")
 plt.show()
 
 # %% [markdown]

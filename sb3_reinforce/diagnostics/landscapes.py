@@ -83,11 +83,13 @@ class Landscape:
     :param utilities: Shape ``(s, s)``: rows are y, columns are x
     :param steps: By name, the projection (x, y) of each gradient on the plane, scaled to the length of the largest
         scale; shape ``(2,)``, or ``(m, 2)`` for m gradients
+    :param n_episodes: Episodes per point
     """
 
     scales: np.ndarray
     utilities: np.ndarray
     steps: dict[str, np.ndarray]
+    n_episodes: int
 
 
 def landscape(
@@ -143,7 +145,7 @@ def landscape(
     for name, gradient in known.items():
         projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*gradient.shape[:-1], 2)
         steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
-    return Landscape(scales.numpy(), utilities.numpy(), steps)
+    return Landscape(scales.numpy(), utilities.numpy(), steps, n_episodes)
 
 
 def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Tensor:
