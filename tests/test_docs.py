@@ -107,6 +107,10 @@ def test_commands_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             runpy.run_path(str(ROOT / words[0]), run_name="__main__")
 
 
+def test_every_reason_not_to_run_a_command_is_needed() -> None:
+    assert all(any(re.search(pattern, command) for _, command in COMMANDS) for pattern in ELSEWHERE)
+
+
 def options_of(command: str) -> str:
     """The source that defines the options of a command that starts Python."""
     zoo = re.search(r"(?:-m sb3_reinforce\.zoo|sb3-reinforce-zoo) (\w+)", command)

@@ -6,6 +6,7 @@ from pathlib import Path
 import yaml
 from rl_zoo3 import ALGOS, utils
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
 
@@ -47,9 +48,8 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
     env_kwargs = arguments["env_kwargs"] or settings.get("env_kwargs")
     # Not the seed of training, whose episodes the agent has seen
     seed = arguments["seed"] + 1000
-    env = utils.create_test_env(
-        env_id, stats_path=stats, seed=seed, should_render=False, hyperparams=hyperparams, env_kwargs=env_kwargs
-    )
+    options = {"seed": seed, "should_render": False, "vec_env_cls": DummyVecEnv}
+    env = utils.create_test_env(env_id, 10, stats, hyperparams=hyperparams, env_kwargs=env_kwargs, **options)
     agent = ALGOS[name].load(model, env=env)
     mean, std = evaluate_policy(agent, env, n_episodes)
     env.close()
