@@ -184,12 +184,12 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
     """
-    ax = new_axes(ax, (6.0, 5.6))
+    ax = new_axes(ax, (6.0, 6.6))
     end = scape.scales[-1]
     # Interpolated between the points, where contours of noisy utilities would be ragged
     square = (-end, end, -end, end)
     surface = ax.imshow(scape.utilities, cmap="Greys_r", origin="lower", extent=square, interpolation="bicubic")
-    ax.figure.colorbar(surface, ax=ax, label="U(θ), mean return of an episode")
+    ax.figure.colorbar(surface, ax=ax, shrink=0.7, label="U(θ), mean return of an episode")
     for index, (name, steps) in enumerate(scape.steps.items()):
         # The lengths differ by estimator, so that no fan hides another
         x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
@@ -202,6 +202,6 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     ax.set_title(f"Utility on a plane through θ (the dot)\n{points}")
     if scape.steps:
         title = "directions of gradients (how many); their lengths mean nothing"
-        legend = {"ncols": 2, "fontsize": "small", "frameon": False, "title": title, "title_fontsize": "small"}
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), **legend)
+        legend = {"fontsize": "small", "frameon": False, "title": title, "title_fontsize": "small"}
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), **legend)
     return ax
