@@ -27,7 +27,7 @@ parser.add_argument("--length", type=int, default=5, help="steps from the cue to
 parser.add_argument("--memory", choices=("none", "rnn", "gru", "lstm"), default="rnn")
 parser.add_argument("--timesteps", type=int, default=30_000)
 parser.add_argument("--seed", type=int, default=0)
-# A notebook has arguments of its own
+# A notebook is started with other arguments
 arguments, _ = parser.parse_known_args()
 th.set_num_threads(1)
 

@@ -34,7 +34,7 @@ returns = np.array([5, -1, 5])
 gradient = (returns * scores).mean()
 theta = 0 + 0.1 * gradient
 print(f"gradient {gradient:.2f}, θ: 0 → {theta:.3f}, π(Right): 0.5 → {1 / (1 + np.exp(-theta)):.3f}")
-assert round(theta, 3) == 0.183
+assert round(gradient, 2) == 1.83 and round(theta, 3) == 0.183
 
 # %% [markdown]
 # ## By the package
@@ -123,6 +123,7 @@ print("no baseline:  ", rollout.returns.flatten().tolist())
 print("mean:         ", (rollout.returns - mean(rollout)).flatten().tolist())
 print("leave one out:", (rollout.returns - leave_one_out(rollout)).flatten().tolist())
 assert (rollout.returns - mean(rollout)).flatten().tolist() == [-2, 0, 2]
+assert (rollout.returns - leave_one_out(rollout)).flatten().tolist() == [-3, 0, 3]
 
 # %% [markdown]
 # Both gradients have the same mean. But if every drawn action gains, then most of a gradient tells which actions

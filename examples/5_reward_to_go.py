@@ -45,7 +45,7 @@ variances = [gradient_statistics(gradients).variance for gradients in (total, to
 print("variance with the total return:", variances[0])
 print("variance with the reward-to-go:", variances[1])
 print(f"ratio {variances[0].value / variances[1].value:.1f}")
-assert variances[0].value > 2 * variances[1].value
+assert variances[0].value > 2.5 * variances[1].value
 
 # %% [markdown]
 # The mean of the difference is zero, and its signal-to-noise ratio not distinguishable from 0: the past rewards were
@@ -117,4 +117,5 @@ print(f"by steps, 1 episode an update:    {(gradient / length).mean() * length.m
 drawn = np.random.default_rng(seed).integers(2, size=(100_000, 16))
 by_steps = (gradient[drawn].sum(1) / length[drawn].sum(1)).mean() * length.mean()
 print(f"by steps, 16 episodes an update:  {by_steps:+.3f}")
-assert gradient.mean() < 0 < (gradient / length).mean() and abs(by_steps + 0.25) < 0.15
+assert gradient.mean() == -0.25 and (gradient / length).mean() > 0
+assert -0.25 < by_steps < -0.15

@@ -55,18 +55,22 @@ for (name, pair), colour in zip(found.items(), ("#D55E00", "#0072B2"), strict=Tr
     print(name)
     for each, bias, noise in zip(lambdas, *pair, strict=True):
         print(f"  λ = {each:4.2f}: bias {bias:4.2f}, noise {noise:5.2f}, both {np.hypot(bias, noise):5.2f}")
-axes[0].set(title="bias", xlabel="λ", ylabel="share of the gradient's norm", ylim=(0, None))
-axes[1].set(title="noise of 16 episodes", xlabel="λ", ylim=(0, None))
+axes[0].set_title("bias")
+axes[1].set_title("standard deviation of 16 episodes")
+for ax in axes:
+    ax.set(xlabel="λ", ylabel="share of the gradient's norm", ylim=(0, None))
 axes[0].legend(frameon=False)
+figure.suptitle("CartPole-v1, one policy, gradients of the same 300 episodes", fontsize="medium")
 plt.show()
 
 # %% [markdown]
-# An untrained critic says nothing of the future, so $\lambda = 0$ loses most of the gradient. A trained one gives
-# almost the same direction with far less noise. The usual $\lambda = 0.95$ is in between. At $\lambda = 1$ a wrong
-# critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
+# An untrained critic knows nothing of the future, so $\lambda = 0$ loses most of the gradient. With a trained one it
+# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ is in between. At $\lambda = 1$ a
+# wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
-assert noise_before[0] < noise_before[-1] and noise_after[0] < noise_after[-1]
+assert noise_before[0] < noise_before[3] < noise_before[-1]
+assert noise_after[0] < noise_after[3] < noise_after[-1] and noise_after[0] < 0.85 * noise_after[-1]
 assert bias_before[0] > bias_before[3] > bias_before[-1] == 0
-assert bias_after[0] < bias_before[0]
+assert bias_before[0] > 0.8 and bias_after[0] < 0.4

@@ -57,14 +57,15 @@ ax.set(title="Mean of 1000 runs", xlabel="update", ylabel="π(Right)", ylim=(0.4
 ax.legend(frameon=False, fontsize="small")
 plt.show()
 large, small, batch, baseline = curves.values()
-assert large[-1] < 0.9 and batch[-1] < 0.99 and baseline[-1] > 0.995
-assert baseline[20] > small[20] + 0.2
+assert large[-1] < 0.85 and small[20] < 0.6 and abs(small[-1] - 0.82) < 0.02
+# A single run that is lost costs 0.001
+assert 0.94 < batch[-1] < 0.985 and baseline[-1] > 0.9992
 
 # %% [markdown]
-# The large step with one episode ends on the wrong action in many runs. The small step gets there, slowly. Twenty
-# episodes allow a step eight times as large, and three runs in a hundred are lost. With a baseline none is. For a
-# gradient with the standard deviation $\sigma_g$ and $T$ updates, theory recommends a rate of about $1 / (\sigma_g
-# \sqrt T)$.
+# The large step with one episode ends on the wrong action in many runs. The small step is slow: after 200 updates it is
+# at 0.82. With twenty episodes a step eight times as large loses only a few runs in a hundred, and with a baseline
+# none. For a gradient with the standard deviation $\sigma_g$ and $T$ updates, theory recommends a rate of about $1 /
+# (\sigma_g \sqrt T)$.
 #
 # ## How noisy is the gradient of a real run?
 #
@@ -74,10 +75,15 @@ assert baseline[20] > small[20] + 0.2
 
 # %%
 class Print(GradientQualityCallback):
-    """Prints the noise scale that it logs."""
+    """Prints the noise scale that it logs, and keeps it."""
+
+    def __init__(self):
+        super().__init__(every=3)
+        self.scales = []
 
     def measure(self, rollout):
         figures = super().measure(rollout)
+        self.scales.append(figures["noise_scale"])
         print(f"{self.num_timesteps:6,} steps: noise scale {figures['noise_scale']:6.1f} episodes")
         return figures
 
@@ -86,7 +92,9 @@ env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
 model = REINFORCE(
     "MlpPolicy", env, baseline="leave_one_out", n_episodes=32, learning_rate=0.01, seed=seed, device="cpu"
 )
-model.learn(15_000, callback=Print(every=3), log_interval=None)
+callback = Print()
+model.learn(15_000, callback=callback, log_interval=None)
+assert callback.scales[-1] > 1.5 * callback.scales[0]
 
 # %% [markdown]
 # ## Two guards

@@ -40,7 +40,10 @@ FOREIGN = {
 MAX_LINES = 250
 # The docstring of an algorithm's class is the reference of its arguments, and its update is read in one place
 LONGER = {"reinforce.py", "finite_difference.py", "recurrent.py"}
-PUBLIC = tuple(f"sb3_reinforce{part}" for part in ("", ".diagnostics", ".estimation", ".recurrent", ".zoo"))
+PACKAGES = ("", ".diagnostics", ".diagnostics.plots", ".estimation", ".recurrent", ".zoo")
+PUBLIC = tuple(f"sb3_reinforce{package}" for package in PACKAGES)
+# What a public module needs beside the dependencies
+NEEDS = {"sb3_reinforce.diagnostics.plots": "matplotlib", "sb3_reinforce.zoo": "rl_zoo3"}
 PRIVATE = re.compile(r"_[a-z]\w*")
 
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
@@ -191,8 +194,8 @@ def parameters_of(thing: object) -> list[str]:
 
 @pytest.mark.parametrize("module_name", PUBLIC)
 def test_public_names_are_there_and_documented(module_name: str) -> None:
-    if module_name == "sb3_reinforce.zoo":
-        pytest.importorskip("rl_zoo3")
+    if module_name in NEEDS:
+        pytest.importorskip(NEEDS[module_name])
     module = importlib.import_module(module_name)
     assert module.__all__
     undocumented = []

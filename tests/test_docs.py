@@ -1,6 +1,9 @@
 """What the README and the pages of ``docs/`` show can be run, and is there."""
 
 import re
+import runpy
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,35 @@ SMALL = {
     r"n_episodes=100": "n_episodes=10",
     r"n_estimates=\d+": "n_estimates=3",
 }
+# What CI appends to a command, by the script or the command of the Zoo, so that it takes seconds
+BUDGETS = {
+    "13_memory.py": "--timesteps 500",
+    "common_random_numbers.py": "--n-delta 4 --n-gradients 2",
+    "comparison_cost.py": "--timesteps 200 --repetitions 1",
+    "enjoy": "--no-render -n 50",
+    "images.py": "--n-envs 1 --timesteps 32 --rounds 1",
+    "masks.py": "--seeds 0 --evaluate-at 256",
+    "record_video": "-n 20",
+    "scaling.py": "--n-envs 64 --timesteps 64 --rounds 1",
+    "search_throughput.py": "--n-envs 2 --n-delta 2 --updates 1 --rounds 1",
+    "search_vs_ars.py": "--env CartPole-v1 --seeds 0 --timesteps 100 --results rows.csv",
+    "throughput.py": "--n-envs 64 --timesteps 64 --rounds 1",
+    "train": "-n 200 --eval-freq -1",
+    "variance_vs_episodes.py": "--timesteps 100 --batches 2 --output .",
+}
+# Why the other commands are not run here
+ELSEWHERE = {
+    r"-m venv|pip install|activate$": "`.ci/run` installs by the README's lines; the extras are looked up below",
+    r"-m pytest$|make (check|docs|examples|wheel)$|^\.ci/run$|/1_reinforce\.py$": "`.ci/run` does it",
+    r"compare(_plots)?\.py": "tests/zoo/test_compare.py runs both scripts",
+    r"-optimize|--trial-id|-f agents$|train --help$": "tests/zoo runs these commands with other settings and folders",
+    r"^make agents$": "minutes; tests/zoo/test_zoo.py runs its two commands",
+    r"torch\.distributed\.run": "tests/common/test_processes.py and tests/zoo/test_zoo_processes.py start the launcher",
+    r"processes\.py": "minutes: it starts eight processes for each row",
+    r"^make (format|test-lowest)$|-m slow$": "it changes files, or takes many minutes: by hand, or at night",
+    r"^hf |^tensorboard |^python train\.py$|python -m sb3_reinforce\.zoo$": "a program of others, or no command",
+}
+IS_COMMAND = re.compile(r"(\S*python[\d.]*|\S*pip|make|hf|tensorboard|\.) \S|\.ci/run$")
 MODULES = {"all_plots": "plots/all_plots", "plot_train": "plots/plot_train", "plot_from_file": "plots/plot_from_file"}
 
 
@@ -30,6 +62,14 @@ def commands(text: str) -> list[str]:
 
 
 COMMANDS = {(name, command) for name, text in TEXTS.items() for command in commands(text)}
+RUN = {
+    name: [
+        command
+        for command in dict.fromkeys(commands(text))
+        if IS_COMMAND.match(command) and not any(re.search(pattern, command) for pattern in ELSEWHERE)
+    ]
+    for name, text in TEXTS.items()
+}
 WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo) \w|\.py\b.* --")
 
 
@@ -43,6 +83,32 @@ def test_python_blocks_run(name: str, tmp_path: Path, monkeypatch: pytest.Monkey
     for budget, small in SMALL.items():
         script = re.sub(budget, small, script)
     exec(compile(script, name, "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("name", [name for name, found in RUN.items() if found])
+@pytest.mark.filterwarnings("ignore")
+def test_commands_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In order, with small budgets, in this process, which has imported PyTorch already."""
+    for module in ("matplotlib", "moviepy", "pygame", "rl_zoo3", "sb3_contrib"):
+        pytest.importorskip(module)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "benchmarks"))
+    for command in RUN[name]:
+        start, *words = shlex.split(command)
+        assert start == "python", f"{name}: {command} is not run, and ELSEWHERE does not say why"
+        is_module = words[0] == "-m"
+        budget = BUDGETS[words[2] if is_module else Path(words[0]).name]
+        options = words[2:] if is_module else words[1:]
+        monkeypatch.setattr(sys, "argv", [command, *options, *shlex.split(budget)])
+        if is_module:
+            runpy.run_module(words[1], run_name="__main__")
+        else:
+            runpy.run_path(str(ROOT / words[0]), run_name="__main__")
+
+
+def test_every_reason_not_to_run_a_command_is_needed() -> None:
+    assert all(any(re.search(pattern, command) for _, command in COMMANDS) for pattern in ELSEWHERE)
 
 
 def options_of(command: str) -> str:

@@ -3,9 +3,9 @@ How do REINFORCE and FiniteDifference compare with A2C, PPO and ARS: by steps, b
 
     python examples/benchmarks/compare.py --tasks CartPole-v1 LunarLander-v3 --seeds 0 1 2 3 4 --output results.csv
 
-All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the settings that the
-RL Zoo publishes (those of another version of the task where it has none for this one), ours those of
-``sb3_reinforce.zoo``; the two searches are run only on tasks that they have settings for.
+All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the RL Zoo's
+settings (for another version of the task where it has none for this one), and ours take ``sb3_reinforce.zoo``'s; the
+two searches are run only on tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and

@@ -224,23 +224,25 @@ def tables(rows: pd.DataFrame) -> str:
     return text
 
 
-def draw(rows: pd.DataFrame, path: Path) -> None:
+def draw(rows: pd.DataFrame, n_rounds: int, path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    from sb3_reinforce.diagnostics.plots import COLOURS
+
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
-    for milliseconds, color in zip(MILLISECONDS, ("C0", "C1", "C2", "C3"), strict=True):
+    for milliseconds, color in zip(MILLISECONDS, COLOURS, strict=False):
         of_step = rows[rows.milliseconds == milliseconds]
         for axis, column in zip(axes, ("rate", "seconds"), strict=True):
             medians = of_step.groupby(["kind", "number"])[column].median()
-            axis.plot(medians["processes"], f"{color}-o", markersize=4, label=f"{milliseconds:g} ms a step")
-            axis.plot(medians["SubprocVecEnv"], f"{color}*", markersize=10)
-        axes[0].plot(of_step[of_step.kind == "model"].set_index("number").rate, f"{color}:")
+            axis.plot(medians["processes"], "-o", color=color, markersize=4, label=f"{milliseconds:g} ms a step")
+            axis.plot(medians["SubprocVecEnv"], "*", color=color, markersize=10)
+        axes[0].plot(of_step[of_step.kind == "model"].set_index("number").rate, ":", color=color)
     axes[0].plot([], [], "k*", markersize=10, label="SubprocVecEnv")
     axes[0].plot([], [], "k:", label="model")
-    axes[0].set(ylabel="steps a second", title="8 environments in all, two cores")
+    axes[0].set(ylabel="steps a second", title=f"8 environments in all, two cores\nmedians of {n_rounds} rounds")
     axes[1].set(ylabel="seconds", title=f"until the mean return is {TARGET:g}")
     for axis in axes:
         axis.set(xlabel="processes", xscale="log", yscale="log")
@@ -269,7 +271,7 @@ def main() -> None:
     rows.loc[unknown, "seconds"] = (rows.steps.median() / rows.rate[unknown]).round(2)
     rows.to_csv(arguments.output.with_suffix(".csv"), index=False)
     print(tables(rows))
-    draw(rows, arguments.output.with_suffix(".png"))
+    draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))
 
 
 if __name__ == "__main__":

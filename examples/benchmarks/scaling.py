@@ -50,7 +50,7 @@ CONTENDERS: dict[str, Callable[[int, int], float]] = {
 }
 
 
-def draw(rows: list[dict[str, object]], path: Path) -> None:
+def draw(rows: list[dict[str, object]], n_rounds: int, path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
@@ -64,7 +64,7 @@ def draw(rows: list[dict[str, object]], path: Path) -> None:
         points = [(row["n_envs"], row["steps_per_second"]) for row in rows if row["contender"] == name]
         axes.loglog(*zip(*points, strict=True), style, color=colour, label=name, markersize=4)
     axes.set(
-        title="Speed by number of environments (medians)",
+        title=f"Speed by number of environments: medians of {n_rounds} rounds",
         xlabel="copies of CartPole-v1",
         ylabel="steps a second, one core",
     )
@@ -99,7 +99,7 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     try:
-        draw(rows, arguments.output.with_suffix(".png"))
+        draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))
     except ImportError:
         print("No picture: matplotlib is not installed (pip install 'sb3-reinforce[plots]')")
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_reinforce import FiniteDifference
 
 RESULTS = Path(__file__).parent / "results" / "search_vs_ars.csv"
-# rl_zoo3 2.9.2, hyperparams/ars.yml; the entry of Swimmer-v5 is that of Swimmer-v4
+# rl_zoo3 2.9.2, hyperparams/ars.yml; Swimmer-v5 has the entry of Swimmer-v4
 ZOO_MLP = dict(
     policy="MlpPolicy", learning_rate=0.018, n_delta=4, n_top=1, delta_std=0.1, zero_policy=False,
     policy_kwargs=dict(net_arch=[16]),

@@ -190,8 +190,8 @@ class BasePolicyGradient(Distributed):
         device: th.device | str = "auto",
     ) -> None:
         """
-        Take parameters from a file or dictionary, which may be those of another algorithm with the same policy class:
-        all of them, or none if anything is wrong.
+        Take parameters from a file or dictionary, also from another algorithm with the same policy class: all of them,
+        or none if anything is wrong.
 
         From a file only tensors are read (``weights_only``): no code in it is run.
 

@@ -47,6 +47,7 @@ def compare_baselines(
     n_resamples: int = 500,
     confidence: float = 0.95,
     seed: int = 0,
+    progress_bar: bool = False,
 ) -> Table[BaselineRow]:
     """
     Measure the noise that each baseline leaves in the gradient of the same whole episodes.
@@ -66,6 +67,7 @@ def compare_baselines(
     :param n_resamples: Number of bootstrap resamples
     :param confidence: Probability with which an interval should cover the true value
     :param seed: Seed of the resamples and of the actions; the environments continue with their own generators
+    :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: A table with one ``BaselineRow`` per baseline
     :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
     :raises ValueError: If there are too few episodes, a name is unknown or used twice, ``"value"`` is given without a
@@ -79,7 +81,8 @@ def compare_baselines(
     check_number("confidence", confidence, 0, 1)
     counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
     with seeded(model.policy, seed):
-        rows = baseline_rows(sample(model, n_episodes), functions, reference, counts, confidence)
+        rollout = sample(model, n_episodes, progress_bar=progress_bar)
+        rows = baseline_rows(rollout, functions, reference, counts, confidence)
     legend = {
         "variance": "trace of the covariance of the gradient of one episode",
         "ratio": f"variance / variance of {reference!r}, on the same resamples",

@@ -147,12 +147,12 @@ class PitfallCallback(Diagnosis):
     """
     Warns once about each of eight known pitfalls of the policy gradient, and names the argument to change.
 
-    Of several pitfalls with one cause only the cause is reported.
+    Where several pitfalls have one cause, only the cause is reported.
 
-    The pitfalls are those of ``pitfalls.PITFALLS``: a learning rate that is too large, returns that are not scaled, too
-    few episodes, the total return, gradients that spike without clipping, a critic that explains nothing, a policy that
-    is deterministic too early, and episodes that are cut. They are detected from what training computes anyway; the
-    cost is three forward passes and a backward pass over at most 256 steps of a rollout. Training is not changed.
+    The pitfalls: a learning rate that is too large, returns that are not scaled, too few episodes, the total return,
+    gradients that spike without clipping, a critic that explains nothing, a policy that is deterministic too early, and
+    episodes that are cut. They are detected from what training computes anyway; the cost is three forward passes and a
+    backward pass over at most 256 steps of a rollout. Training is not changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
 

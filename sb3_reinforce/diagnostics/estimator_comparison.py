@@ -9,8 +9,8 @@ from functools import partial
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number, check_unless_none
-from sb3_reinforce.diagnostics.landscapes import CandidateUtility, episode_bar
-from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, seeded
+from sb3_reinforce.diagnostics.landscapes import CandidateUtility
+from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
 from sb3_reinforce.estimation import baselines

@@ -1,7 +1,6 @@
 """The performance landscape: U(θ) on a plane through a policy's parameters, and gradients projected on it."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -12,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.common.arguments import check_integer, check_number
-from sb3_reinforce.diagnostics.sampling import env_of, seeded
+from sb3_reinforce.diagnostics.sampling import env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
 from sb3_reinforce.policies.parameters import actor_parameters, read
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
@@ -75,15 +74,6 @@ class CandidateUtility:
             self.bar.update(int(np.count_nonzero(step.finished)))
 
 
-def episode_bar(progress_bar: bool, n_episodes: int | None = None) -> AbstractContextManager[Any]:
-    """A progress bar that counts episodes, or None; only the bar needs tqdm."""
-    if not progress_bar:
-        return nullcontext()
-    from tqdm import tqdm
-
-    return cast(AbstractContextManager[Any], tqdm(total=n_episodes, unit=" episodes"))
-
-
 @dataclass(frozen=True)
 class Landscape:
     """
@@ -93,11 +83,13 @@ class Landscape:
     :param utilities: Shape ``(s, s)``: rows are y, columns are x
     :param steps: By name, the projection (x, y) of each gradient on the plane, scaled to the length of the largest
         scale; shape ``(2,)``, or ``(m, 2)`` for m gradients
+    :param n_episodes: Episodes per point
     """
 
     scales: np.ndarray
     utilities: np.ndarray
     steps: dict[str, np.ndarray]
+    n_episodes: int
 
 
 def landscape(
@@ -122,7 +114,7 @@ def landscape(
     :param n_points: Points along each side
     :param n_episodes: Episodes per point
     :param seed: Seed of the directions and of the episodes
-    :param progress_bar: Display a progress bar using tqdm
+    :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The utilities on the plane, and the projections of the gradients
     :raises TypeError: If an argument is of the wrong kind
     :raises ValueError: If an argument is out of its range or of the wrong shape
@@ -153,7 +145,7 @@ def landscape(
     for name, gradient in known.items():
         projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*gradient.shape[:-1], 2)
         steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
-    return Landscape(scales.numpy(), utilities.numpy(), steps)
+    return Landscape(scales.numpy(), utilities.numpy(), steps, n_episodes)
 
 
 def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Tensor:

@@ -200,7 +200,7 @@ def cut_episodes(history: History) -> str | None:
     share = fmean(update.used_fraction for update in history.updates)
     if model.n_steps is not None and not model.has_critic and share < 0.9:
         return (
-            f"n_steps={model.n_steps} cuts episodes: {1 - share:.0%} of the steps are left out, mostly those of long "
+            f"n_steps={model.n_steps} cuts episodes: {1 - share:.0%} of the steps are left out, mostly in long "
             "episodes, which biases the gradient. Set n_episodes instead, or use baseline='value'"
         )
     return None

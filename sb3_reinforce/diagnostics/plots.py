@@ -70,7 +70,8 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     (reference, *_) = (row.baseline for row in rows if row.ratio.low == row.ratio.high == 1)
     ax.set(xlabel=f"variance / variance of {reference}")
     ax.set_title(table.title.replace(" (", "\n("))
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False)
+    bars = f"lines: {table.legend['[a, b]'].partition(';')[0]}s"
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False, title=bars)
     return ax
 
 
@@ -167,7 +168,7 @@ def plot_variances(
         mean = variances.mean(axis=0)
         ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance (trace of the covariance)")
-    ax.set_title("Variance of the gradient")
+    ax.set_title(f"Variance of the gradient: mean of {len(variances)} repetitions")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
     ax.xaxis.set_minor_locator(NullLocator())
     ax.grid(axis="y", alpha=0.3)
@@ -183,21 +184,24 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
     """
-    ax = new_axes(ax, (6.0, 5.6))
+    ax = new_axes(ax, (6.0, 6.6))
     end = scape.scales[-1]
     # Interpolated between the points, where contours of noisy utilities would be ragged
     square = (-end, end, -end, end)
     surface = ax.imshow(scape.utilities, cmap="Greys_r", origin="lower", extent=square, interpolation="bicubic")
-    ax.figure.colorbar(surface, ax=ax, label="U(θ), mean return of an episode")
+    ax.figure.colorbar(surface, ax=ax, shrink=0.7, label="U(θ), mean return of an episode")
     for index, (name, steps) in enumerate(scape.steps.items()):
         # The lengths differ by estimator, so that no fan hides another
         x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
         colour = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
         arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
-        arrows.set(label=name, edgecolor="black", linewidth=0.4)
+        arrows.set(label=f"{name} ({len(x)})", edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
-    ax.set(xlabel="first direction, in multiples of its norm", ylabel="second direction")
-    ax.set_title("Utility on a plane through θ (the dot), and directions\nof gradients (their lengths mean nothing)")
+    ax.set(xlabel="first direction, in multiples of its norm", ylabel="second direction, in multiples of its norm")
+    points = f"{len(scape.scales)} × {len(scape.scales)} points of {scape.n_episodes} episodes"
+    ax.set_title(f"Utility on a plane through θ (the dot)\n{points}")
     if scape.steps:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize="small", frameon=False)
+        title = "directions of gradients (how many); their lengths mean nothing"
+        legend = {"fontsize": "small", "frameon": False, "title": title, "title_fontsize": "small"}
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), **legend)
     return ax

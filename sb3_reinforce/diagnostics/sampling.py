@@ -1,10 +1,11 @@
 """Collect episodes for a measurement with the model's own code, without changing the model."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import ConvertCallback
@@ -19,7 +20,7 @@ from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
 
 
-def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Rollout:
+def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progress_bar: bool = False) -> Rollout:
     """
     Whole episodes of the model's policy in its environments, with the model's own returns.
 
@@ -31,19 +32,36 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None) -> Ro
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: The baseline to collect with; None for ``"value"`` if the model has a critic, else ``"none"``
+    :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The rollout; it has ``values`` only if the baseline is ``"value"``
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     check_model(model)
     collector = model.sampling_copy(check_integer("n_episodes", n_episodes, 2), baseline)
-    with undisturbed(model):
-        return collect_episodes(collector)
+    with undisturbed(model), episode_bar(progress_bar, n_episodes) as bar:
+        return collect_episodes(collector, bar)
 
 
-def collect_episodes(collector: REINFORCE) -> Rollout:
-    """Let a sampling copy collect its episodes; as for any callback, log π goes into its rollout buffer."""
-    callback = ConvertCallback(lambda *_: True)
+def episode_bar(progress_bar: bool, n_episodes: int | None = None) -> AbstractContextManager[Any]:
+    """A progress bar that counts episodes, or None; only the bar needs tqdm."""
+    if not progress_bar:
+        return nullcontext()
+    from tqdm import tqdm
+
+    return cast(AbstractContextManager[Any], tqdm(total=n_episodes, unit=" episodes"))
+
+
+def collect_episodes(collector: REINFORCE, bar: Any = None) -> Rollout:
+    """Let a sampling copy collect its episodes, counted by a bar of tqdm or None, with log π in its rollout buffer."""
+
+    def count(local: dict[str, Any], _: dict[str, Any]) -> bool:
+        if bar is not None:
+            # An environment that has played its quota goes on, and its further episodes do not count
+            bar.update(int(np.count_nonzero(local["dones"] & (local["extent"].remaining > 0))))
+        return True
+
+    callback = ConvertCallback(count)
     callback.init_callback(collector)
     collector.collect_rollouts(cast(VecEnv, collector.env), callback, collector.rollout_buffer, None)
     return cast(Rollout, collector.rollout)
@@ -71,8 +89,8 @@ def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent:
     check_kind("model", model, kinds, f"a {' or '.join(kind.__name__ for kind in kinds)}")
     if independent and model.use_sde and model.sde_sample_freq != 1:
         raise ValueError(
-            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, and the "
-            "variance between them is not that of independent samples. Measure a model with sde_sample_freq=1, or "
+            f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, so they "
+            "are not independent samples. Measure a model with sde_sample_freq=1, or "
             "without use_sde"
         )
     return env_of(model)

@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
-from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded
+from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
 from sb3_reinforce.envs.starts import check_groups
@@ -46,7 +46,12 @@ class StartReport:
 
 
 def compare_starts(
-    model: REINFORCE, n_starts: int = 32, n_resamples: int = 500, confidence: float = 0.95, seed: int = 0
+    model: REINFORCE,
+    n_starts: int = 32,
+    n_resamples: int = 500,
+    confidence: float = 0.95,
+    seed: int = 0,
+    progress_bar: bool = False,
 ) -> StartReport:
     """
     Measure whether groups of episodes that share their start would reduce the variance of the gradient.
@@ -60,6 +65,7 @@ def compare_starts(
     :param n_resamples: Number of bootstrap resamples of the starts
     :param confidence: Probability with which an interval should cover the true value
     :param seed: Seed of the starts, of the actions and of the resamples
+    :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The share and the predicted gains
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If an argument is out of its range, if the episodes are not independent because they share the
@@ -71,7 +77,7 @@ def compare_starts(
     check_number("confidence", confidence, 0, 1)
     counts = resamples(n_starts, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
     with seeded(model.policy, seed):
-        rollouts = sample_starts(model, n_starts)
+        rollouts = sample_starts(model, n_starts, progress_bar)
         # G_t and m_t, (n_steps, n_starts, N_PER_START)
         returns = side_by_side([rollout.returns * rollout.used for rollout in rollouts])
         used = side_by_side([rollout.used.double() for rollout in rollouts])
@@ -82,7 +88,7 @@ def compare_starts(
     return StartReport(interval(share_between(returns[0], counts), confidence), gains)
 
 
-def sample_starts(model: REINFORCE, n_starts: int) -> list[Rollout]:
+def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -> list[Rollout]:
     """Rollouts of one episode per environment, which play ``N_PER_START`` episodes of each start in turn."""
     env = check_model(model)
     collector = model.sampling_copy(env.num_envs, "none")
@@ -90,12 +96,12 @@ def sample_starts(model: REINFORCE, n_starts: int) -> list[Rollout]:
     seeds = th.randint(2**31, (n_starts,)).numpy().repeat(N_PER_START)
     rollouts = []
     firsts = []
-    with undisturbed(model):
+    with undisturbed(model), episode_bar(progress_bar, len(seeds)) as bar:
         # Pending seeds would replace the seeds of the first episodes
         env.reset()
         for part in seeds.reshape(-1, env.num_envs):
             firsts.append(start_from(collector, part))
-            rollouts.append(collect_episodes(collector))
+            rollouts.append(collect_episodes(collector, bar))
         # Environments that have shared a start would go on with the same random numbers
         env.seed(int(th.randint(2**31, ())))
         check_groups(stack([take(obs, i) for obs in firsts for i in range(env.num_envs)]), N_PER_START)

@@ -75,7 +75,7 @@ class GymnasiumVecEnv(VecEnv):
         ended = np.flatnonzero(dones).tolist()
         if self.restart is None and ended and "final_obs" not in env_infos:
             raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
-        # A copy that has reset itself returns the last step's observation and infos apart from those of the reset
+        # A copy that has reset itself returns the last step's observation and infos in separate entries
         last_obs = env_infos.pop("final_obs", obs)
         last_infos = env_infos.pop("final_info", env_infos)
         for mask in ("_final_obs", "_final_info"):
@@ -198,7 +198,7 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
         return
     rows = np.asarray(obs)
     if rows.shape[:1] != (n_envs,):
-        raise BadData(f"The observations must be those of {n_envs} environments, got shape {rows.shape}")
+        raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
     # Rows of one array share their form; what is not in a Box must be in its space too
     for i in range(1 if isinstance(space, spaces.Box) else n_envs):
         check_observation(space, rows[i], i)

@@ -1,5 +1,7 @@
 """It learns: a small version in a few seconds, and the README's claim on all its seeds."""
 
+import itertools
+
 import gymnasium as gym
 import pytest
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
@@ -11,9 +13,11 @@ from stable_baselines3.common.vec_env import VecMonitor
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
+ENVS = [IdentityEnv, IdentityEnvMultiDiscrete, IdentityEnvMultiBinary, IdentityEnvBox]
+CASES = [*itertools.product(ENVS, ["leave_one_out", "value"]), (IdentityEnv, "none"), (IdentityEnv, "time_mean")]
 
-@pytest.mark.parametrize("baseline", ["none", "time_mean", "leave_one_out", "value"])
-@pytest.mark.parametrize("env_class", [IdentityEnv, IdentityEnvMultiDiscrete, IdentityEnvMultiBinary, IdentityEnvBox])
+
+@pytest.mark.parametrize(("env_class", "baseline"), CASES)
 def test_to_repeat_the_observation(env_class, baseline):
     """Nearly all of the 100 rewards of an episode, from each action space and with and without a critic."""
     box = env_class is IdentityEnvBox

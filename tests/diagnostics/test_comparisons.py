@@ -123,6 +123,13 @@ def test_time_or_state_halve_the_variance_on_cartpole():
     assert min(table["value"].ratio.high, table["time_mean"].ratio.high) < 0.7
 
 
+def test_a_progress_bar_counts_the_episodes(capsys):
+    """What an environment plays beyond its share does not count."""
+    env = make_vec_env(lambda: Tree(ragged=True), 3, seed=0)
+    compare_baselines(REINFORCE("MlpPolicy", env, device="cpu"), 20, progress_bar=True)
+    assert "| 20/20 [" in capsys.readouterr().err
+
+
 def test_bias_is_told_where_theory_knows_it():
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
     assert [table[name].bias for name in ("none", "leave_one_out", "value", "optimal")] == [0, 0, 0, 0]

@@ -113,6 +113,7 @@ def test_every_picture_can_be_saved(tmp_path):
     ax = plots.plot_baselines(table)
     assert [label.get_text() for label in ax.get_yticklabels()] == table.names[:-1]
     assert ax.get_xlabel() == "variance / variance of none"
+    assert ax.get_legend().get_title().get_text() == "lines: 95% bootstrap intervals"
     drawn = {line.get_ydata()[0]: line for line in ax.get_lines() if len(line.get_xdata()) == 1}
     for y, row in enumerate(list(table)[:-1]):
         assert drawn[y].get_xdata() == [row.ratio.value]
@@ -125,9 +126,11 @@ def test_every_picture_can_be_saved(tmp_path):
     found = landscape(bandit(), fans, n_points=3, n_episodes=2, progress_bar=True)
     assert [steps.shape for steps in found.steps.values()] == [(2,), (3, 2)]
     ax = plots.plot_landscape(found)
-    assert ax.get_title() and ax.get_xlim() == (-1, 1)
+    assert "3 × 3 points of 2 episodes" in ax.get_title() and ax.get_xlim() == (-1, 1)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["one (1)", "three (3)"]
     save(ax, tmp_path / "landscape.png")
     ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])
+    assert "3 repetitions" in ax.get_title()
     save(ax, tmp_path / "variances.png")
 
 

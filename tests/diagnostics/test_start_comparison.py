@@ -55,6 +55,11 @@ def test_the_model_is_left_as_it_was():
     model.learn(64)
 
 
+def test_a_progress_bar_counts_the_episodes(capsys):
+    compare_starts(make_model(), n_starts=6, progress_bar=True)
+    assert "| 48/48 [" in capsys.readouterr().err
+
+
 def test_what_cannot_be_compared_is_refused():
     model = make_model(ignores_seed=True)
     with pytest.raises(ValueError, match="cannot share their start"):

@@ -207,8 +207,8 @@ class Malformed(SyncVectorEnv):
     ("change", "message"),
     [
         (lambda obs, rewards: (obs[:, :3], rewards), r"observation of environment 0 must have shape \(4,\)"),
-        (lambda obs, rewards: (obs.reshape(4, 3), rewards), "observations must be those of 3 environments"),
-        (lambda obs, rewards: (obs[:1], rewards), "observations must be those of 3 environments"),
+        (lambda obs, rewards: (obs.reshape(4, 3), rewards), "must be observations of 3 environments"),
+        (lambda obs, rewards: (obs[:1], rewards), "must be observations of 3 environments"),
         (lambda obs, rewards: (obs + 1j, rewards), "dtype"),
         (lambda obs, rewards: (obs, rewards[:, None]), "rewards must be 3 numbers"),
         (lambda obs, rewards: (obs, rewards[:1]), "rewards must be 3 numbers"),

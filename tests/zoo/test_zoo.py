@@ -1,6 +1,7 @@
 """The RL Zoo's commands end to end, for both algorithms and one of the Zoo's own, and what they say of errors."""
 
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from zoo_commands import NAMES, RUN, config_of, message_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
+from sb3_reinforce.zoo.model_card import write_card
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,19 @@ def test_enjoy(name, folder, capsys):
     for which in ((), ("--load-best",), ("--load-last-checkpoint",)):
         zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
         assert "Mean reward: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_model_card_describes_the_last_agent(name, folder):
+    card = write_card("logs", name, "CartPole-v1", n_episodes=2)
+    assert card == Path("logs", name, "CartPole-v1_2", "README.md")
+    _, metadata, text = card.read_text().split("---\n")
+    assert yaml.safe_load(metadata)["library_name"] == "stable-baselines3"
+    assert f"**{ALGORITHMS[name].__name__}** Agent playing **CartPole-v1**" in text
+    assert re.search(r"2 deterministic episodes, after training with seed 1: \*\*\d+\.\d\d ± \d+\.\d\d\*\*", text)
+    assert f"enjoy --algo {name} --env CartPole-v1 -f logs\n" in text and "-n 400 -f logs --seed 1" in text
+    settings = text.partition("```yaml\n")[2].partition("```")[0]
+    assert yaml.safe_load(settings) == config_of(card.parent)
 
 
 @pytest.mark.parametrize("name", ["reinforce", "finite_difference"])

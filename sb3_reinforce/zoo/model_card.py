@@ -1,0 +1,79 @@
+"""Model cards: ``python -m sb3_reinforce.zoo.model_card --algo reinforce --env CartPole-v1 -f agents``."""
+
+import argparse
+from pathlib import Path
+
+import yaml
+from rl_zoo3 import ALGOS, utils
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
+
+CARD = """---
+library_name: stable-baselines3
+tags: [{env}, deep-reinforcement-learning, reinforcement-learning, stable-baselines3]
+---
+
+# **{algorithm}** Agent playing **{env}**
+
+Mean reward of {n_episodes} deterministic episodes, after training with seed {seed}: **{mean:.2f} ± {std:.2f}**
+
+## Usage (with the RL Zoo)
+
+```sh
+python -m sb3_reinforce.zoo enjoy --algo {name} --env {env} -f {folder}
+```
+
+## Training
+
+```sh
+python -m sb3_reinforce.zoo train --algo {name} --env {env} -n {timesteps} -f {folder} --seed {seed}
+```
+
+## Hyperparameters
+
+```yaml
+{settings}```
+"""
+
+
+def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Path:
+    """Evaluate the last agent that ``train`` has saved in a folder, and write ``README.md`` beside it."""
+    _, model, run = utils.get_model_path(0, folder, name, utils.EnvironmentName(env_id))
+    saved = Path(run, env_id)
+    arguments = yaml.unsafe_load((saved / "args.yml").read_text())
+    settings = dict(yaml.unsafe_load((saved / "config.yml").read_text()))
+    hyperparams, stats = utils.get_saved_hyperparams(str(saved), test_mode=True)
+    env_kwargs = arguments["env_kwargs"] or settings.get("env_kwargs")
+    # Not the seed of training, whose episodes the agent has seen
+    seed = arguments["seed"] + 1000
+    options = {"seed": seed, "should_render": False, "vec_env_cls": DummyVecEnv}
+    env = utils.create_test_env(env_id, 10, stats, hyperparams=hyperparams, env_kwargs=env_kwargs, **options)
+    agent = ALGOS[name].load(model, env=env)
+    mean, std = evaluate_policy(agent, env, n_episodes)
+    env.close()
+    path = Path(run, "README.md")
+    card = CARD.format(
+        algorithm=type(agent).__name__,
+        env=env_id,
+        folder=folder,
+        mean=mean,
+        n_episodes=n_episodes,
+        name=name,
+        seed=arguments["seed"],
+        settings=yaml.safe_dump(settings),
+        std=std,
+        timesteps=max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"]),
+    )
+    path.write_text(card)
+    return path
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--algo", required=True)
+    parser.add_argument("--env", required=True)
+    parser.add_argument("-f", "--folder", required=True)
+    given = parser.parse_args()
+    print(write_card(given.folder, given.algo, given.env))
