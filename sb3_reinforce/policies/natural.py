@@ -48,7 +48,8 @@ def natural_step(
     parameters = [each for each, _ in pairs]
     g = to_vector([gradient for _, gradient in pairs])
     norm = finite_norm(g, "policy")
-    if norm == 0:
+    # A schedule may fall to a target of 0
+    if norm == 0 or target_kl == 0:
         return norm, 0.0
     divergence = divergence_from_now(policy, obs)
     fisher_product = hessian_product(divergence(), parameters)
