@@ -453,10 +453,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         else:
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
                 grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
-            # A second pass in training mode would move the statistics of a batch normalization again
-            self.policy.set_training_mode(False)
+            if route.actor is None:
+                # Another pass over images or sequences would take longer than a log is worth
+                return grad_norm
             kl = sampled_divergence(self.policy, route, batch.observations, batch.actions, log_prob)
-            self.policy.set_training_mode(True)
         self.logger.record("train/kl", kl)
         return grad_norm
 
