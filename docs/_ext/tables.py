@@ -241,7 +241,7 @@ def processes_model() -> str:
 def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
-        comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars, common_random_numbers,
-        search_throughput, throughput, images, processes, processes_model,
+        comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
+        common_random_numbers, search_throughput, throughput, images, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}
