@@ -49,7 +49,7 @@ from sb3_reinforce.policies.evaluation import (
     split_parameters,
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, natural_step
+from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
 from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
@@ -61,7 +61,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
-    One optimizer step per rollout, along
+    One step per rollout, along
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
@@ -78,7 +78,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
     A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
     which would move the policy a second time. The policy step trains it: ``vf_coef`` times the critic's squared error
-    is then part of its loss.
+    is then part of its loss. The natural step leaves this out, so that the critic does not train the extractor.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a class)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
@@ -90,8 +90,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
         ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
-    :param vf_coef: Weight of the critic's squared error in the policy step, where a features extractor is shared;
-        not used by the natural step, whose length would then be that of another direction
+    :param vf_coef: Weight of the critic's squared error in the optimizer's step, where a features extractor is shared
     :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None or inf for no
         bound
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
@@ -124,9 +123,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         samples and where the deviation is 0
     :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
         (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. It takes
-        rollouts of some thousand steps
-    :param target_kl: With ``step="natural"``, the mean KL divergence of the policy after the step from the policy
-        before it, at the states of the rollout; it can be a schedule. None for 0.01
+        rollouts of a thousand steps or more, and a policy without dropout and batch normalization
+    :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout, before
+        ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
@@ -415,14 +414,16 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
+        # The natural step bounds the policy's change, which the critic's error would be no part of
+        with_values = bool(shared) and self.step == "optimizer"
         log_prob, entropy, values = evaluate(
-            self.policy, route, batch.observations, batch.actions, with_values=bool(shared)
+            self.policy, route, batch.observations, batch.actions, with_values=with_values
         )
         # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
         # (Williams, 1992, equation 4)
         policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
         loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
-        if shared and values is not None and self.step == "optimizer":
+        if with_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
             loss = loss + self.vf_coef * F.mse_loss(values, batch.returns)
         grad_norm = 0.0
@@ -449,7 +450,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """One step against the gradients of the loss; ``log_prob`` is log π before it."""
         if self.step == "natural":
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
+            # The divergence is one of the policy that acts
+            self.policy.set_training_mode(False)
+            check_distribution(self.policy, batch.observations, batch.actions, log_prob)
             grad_norm, kl = natural_step(self.policy, batch.observations, actor, gradients, target_kl)
+            self.policy.set_training_mode(True)
         else:
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
                 grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")

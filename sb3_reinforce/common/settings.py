@@ -110,7 +110,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
     "normalize_advantage": check_flag,
     "step": partial(check_choice, choices=("optimizer", "natural")),
-    "target_kl": optional(partial(CheckedSchedule, low=0, above=True)),
+    "target_kl": optional(partial(CheckedSchedule, low=0)),
 }
 FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "estimator": check_name,
@@ -166,7 +166,8 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
         raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
     if model.target_kl is not None and model.step != "natural":
-        raise ValueError(f"target_kl={model.target_kl!r} needs step='natural', got step={model.step!r}")
+        got = f"target_kl={model.target_kl!r} and step={model.step!r}"
+        raise ValueError(f"target_kl must be None unless step='natural', got {got}")
     if isinstance(model.action_space, spaces.Box):
         if model.temperature != 1:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")

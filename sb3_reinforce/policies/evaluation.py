@@ -149,10 +149,14 @@ def sampled_divergence(
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
 
-    Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative.
+    Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative. NaN if π's outputs are.
     """
-    log_ratio = evaluate(policy, route, obs, actions, with_values=False)[0] - log_prob
-    return float((log_ratio.exp() - 1 - log_ratio).mean())
+    try:
+        log_ratio = evaluate(policy, route, obs, actions, with_values=False)[0] - log_prob
+    except ValueError:
+        # PyTorch makes no distribution of outputs that are not finite; the next rollout reports them
+        return math.nan
+    return float((th.expm1(log_ratio) - log_ratio).mean())
 
 
 def split_parameters(

@@ -29,7 +29,8 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
     if sampled["baseline"] != "value" or trial.suggest_categorical("whole_episodes", [False, True]):
         sampled["n_episodes_pow"] = trial.suggest_int("n_episodes_pow", 2, 6)
     else:
-        sampled["n_steps_pow"] = trial.suggest_int("n_steps_pow", 3, 9)
+        low, high = (7, 11) if sampled["step"] == "natural" else (3, 9)
+        sampled["n_steps_pow"] = trial.suggest_int("n_steps_pow", low, high)
     if sampled["baseline"] == "value":
         sampled["one_minus_gae_lambda"] = trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True)
         sampled["batch_size_pow"] = trial.suggest_int("batch_size_pow", 5, 9)

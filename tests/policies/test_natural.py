@@ -1,4 +1,6 @@
-"""The natural step: the direction F⁻¹ g, invariant to the parametrization, and as long as the divergence allows."""
+"""The natural step: the direction F⁻¹ g, without damping invariant to the parametrization, as long as KL allows."""
+
+from copy import copy, deepcopy
 
 import numpy as np
 import pytest
@@ -7,14 +9,18 @@ from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch.distributions import kl_divergence
 
 from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
-from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import route_of, sampled_divergence
-from sb3_reinforce.policies.natural import natural_step
+from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
+from sb3_reinforce.policies.natural import conjugate_gradients, natural_step, walk
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 # The states of the tree, as often as a rollout might visit them
@@ -76,26 +82,53 @@ def test_the_step_does_not_depend_on_the_parametrization():
     assert (logits[False, "x"] - logits[False, "M x"]).abs().max() > 0.01
 
 
-class Divergences:
-    """Keeps what a model logs as ``train/kl``."""
+class Divergences(BaseCallback):
+    """Measures how far each update moves the policy: KL(π_before ‖ π_after) at the states of its rollout."""
 
-    def __init__(self, model):
+    def __init__(self):
+        super().__init__()
         self.found = []
-        self.record = model.logger.record
-        model.logger.record = self
+        self.logged = []
+        self.before = None
 
-    def __call__(self, key, value, *args, **kwargs):
-        if key == "train/kl":
-            self.found.append(value)
-        self.record(key, value, *args, **kwargs)
+    def _on_step(self):
+        return True
+
+    def measure(self):
+        if self.before is not None:
+            policy = self.model.policy
+            before, obs, actions = self.before
+            after = deepcopy(policy.state_dict())
+            with th.no_grad():
+                new = copy(action_distribution(policy, obs))
+                policy.load_state_dict(before)
+                old = action_distribution(policy, obs)
+            kl = 0.0
+            for p, q in zip(independent(old), independent(new), strict=True):
+                kl = kl + kl_divergence(p, q).reshape(len(actions), -1).sum(1)
+            policy.load_state_dict(after)
+            self.found.append(float(kl.mean()))
+            self.logged.append(self.model.logger.name_to_value["train/kl"])
+
+    _on_rollout_start = _on_training_end = measure
+
+    def _on_rollout_end(self):
+        rollout = self.model.rollout
+        obs = select(rollout.inputs, rollout.used)
+        self.before = deepcopy(self.model.policy.state_dict()), obs, select(rollout.actions, rollout.used)
+
+
+def independent(distribution):
+    """The distributions of PyTorch whose product it is."""
+    inner = distribution.distribution
+    return inner if isinstance(inner, list) else [inner]
 
 
 def divergences_of(model, total_timesteps):
-    model._setup_learn(0)
-    divergences = Divergences(model)
-    model.set_logger(model.logger)
-    model.learn(total_timesteps)
-    return np.array(divergences.found)
+    callback = Divergences()
+    model.learn(total_timesteps, callback, log_interval=None)
+    np.testing.assert_allclose(callback.logged, callback.found, rtol=1e-3, atol=1e-6)
+    return np.array(callback.found)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -160,6 +193,77 @@ def test_where_no_step_is_possible_the_parameters_stay():
     assert th.equal(weight, before)
 
 
+@pytest.mark.parametrize("answer", [np.inf, np.nan, ValueError("not finite")])
+def test_a_step_that_cannot_be_measured_is_taken_back(answer):
+    weight = th.nn.Parameter(th.ones(3))
+
+    def divergence():
+        if isinstance(answer, Exception):
+            raise answer
+        return th.tensor(answer)
+
+    assert walk([weight], th.ones(3), 1.0, divergence, 0.01) is None
+    assert th.equal(weight, th.ones(3))
+
+
+def test_after_an_error_the_parameters_are_those_before():
+    weight = th.nn.Parameter(th.ones(3))
+
+    def divergence():
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        walk([weight], th.ones(3), 1.0, divergence, 0.01)
+    assert th.equal(weight, th.ones(3))
+
+
+@pytest.mark.parametrize("matrix", [th.diag(th.tensor([1.0, -1.0])), th.full((2, 2), th.nan)])
+def test_an_indefinite_system_has_no_direction(matrix):
+    assert not conjugate_gradients(lambda v: matrix @ v, th.tensor([1.0, 0.5])).any()
+
+
+def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
+    """The divergence of a policy that is almost deterministic grows faster than the square of the step."""
+    weight = th.nn.Parameter(th.zeros(1))
+    kl = walk([weight], th.ones(1), 10.0, lambda: (weight**8).sum(), 0.01)
+    assert 0.01 / 2**8 <= kl <= 0.012
+
+
+class Scaled(ActorCriticPolicy):
+    """Learns from other features than ``get_distribution`` sees."""
+
+    def extract_features(self, obs, features_extractor=None):
+        return 5 * super().extract_features(obs, features_extractor)
+
+    def get_distribution(self, obs):
+        return super().get_distribution(obs / 5)
+
+
+def test_a_policy_with_another_distribution_is_refused():
+    model = REINFORCE(Scaled, "CartPole-v1", step="natural", n_steps=32, seed=0)
+    before = to_vector(model.policy.parameters())
+    with pytest.raises(ValueError, match="get_distribution of Scaled does not give the log π"):
+        model.learn(32)
+    assert th.equal(to_vector(model.policy.parameters()), before)
+
+
+def test_equal_returns_are_no_gradient():
+    """The mean of equal returns may differ from them by rounding."""
+    env = DummyVecEnv([lambda: Corridor((3,), lambda t, action: 0.1 + 0.1 * t)] * 3)
+    model = REINFORCE("MlpPolicy", env, step="natural", baseline="leave_one_out", n_episodes=6, seed=0)
+    assert divergences_of(model, 18) == [0.0]
+
+
+def test_the_critic_does_not_move_shared_features():
+    features = []
+    for vf_coef in (0.0, 9.0):
+        env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1)
+        env.observation_space.seed(0)
+        model = REINFORCE("CnnPolicy", env, step="natural", n_steps=32, vf_coef=vf_coef, seed=0).learn(32)
+        features.append(to_vector(model.policy.features_extractor.parameters()))
+    assert th.equal(*features)
+
+
 def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
     policy = make_model().policy
     route = route_of(policy)
@@ -180,10 +284,10 @@ def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
 def test_arguments():
     with pytest.raises(ValueError, match="step must be one of 'optimizer', 'natural', got 'adam'"):
         REINFORCE("MlpPolicy", "CartPole-v1", step="adam")
-    with pytest.raises(ValueError, match=r"target_kl=0.01 needs step='natural', got step='optimizer'"):
+    with pytest.raises(ValueError, match="target_kl must be None unless step='natural', got target_kl=0.01"):
         REINFORCE("MlpPolicy", "CartPole-v1", target_kl=0.01)
     with pytest.raises(ValueError, match="target_kl must be"):
-        REINFORCE("MlpPolicy", "CartPole-v1", step="natural", target_kl=0.0)
+        REINFORCE("MlpPolicy", "CartPole-v1", step="natural", target_kl=-0.1)
 
 
 def test_a_target_may_fall_to_0(recwarn):
