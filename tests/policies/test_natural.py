@@ -284,7 +284,7 @@ def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
 def test_arguments():
     with pytest.raises(ValueError, match="step must be one of 'optimizer', 'natural', got 'adam'"):
         REINFORCE("MlpPolicy", "CartPole-v1", step="adam")
-    with pytest.raises(ValueError, match="target_kl must be None unless step='natural', got target_kl=0.01"):
+    with pytest.raises(ValueError, match="target_kl must be None unless step='natural', got target_kl="):
         REINFORCE("MlpPolicy", "CartPole-v1", target_kl=0.01)
     with pytest.raises(ValueError, match="target_kl must be"):
         REINFORCE("MlpPolicy", "CartPole-v1", step="natural", target_kl=-0.1)
