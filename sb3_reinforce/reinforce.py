@@ -2,6 +2,7 @@
 
 import copy
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -43,10 +44,12 @@ from sb3_reinforce.policies.evaluation import (
     evaluate,
     floor_std,
     route_of,
+    sampled_divergence,
     set_temperature,
     split_parameters,
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
+from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
 from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
@@ -58,7 +61,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
-    One optimizer step per rollout, along
+    One step per rollout, along
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
@@ -75,7 +78,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
     A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
     which would move the policy a second time. The policy step trains it: ``vf_coef`` times the critic's squared error
-    is then part of its loss.
+    is then part of its loss. The natural step leaves this out, so that the critic does not train the extractor.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a class)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
@@ -87,7 +90,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
         ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
-    :param vf_coef: Weight of the critic's squared error in the policy step, where a features extractor is shared
+    :param vf_coef: Weight of the critic's squared error in the optimizer's step, where a features extractor is shared
     :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None or inf for no
         bound
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
@@ -118,6 +121,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
     :param normalize_advantage: Scale G_t − b_t to mean 0 and standard deviation 1 per rollout; skipped below two
         samples and where the deviation is 0
+    :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
+        (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. It takes
+        rollouts of a thousand steps or more, and a policy without dropout and batch normalization
+    :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout, before
+        ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
@@ -167,6 +175,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer_class: type[RolloutBuffer] | None = None,
         rollout_buffer_kwargs: dict[str, Any] | None = None,
         normalize_advantage: bool = False,
+        step: str = "optimizer",
+        target_kl: float | Schedule | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -211,6 +221,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.min_std = min_std
         self.max_episode_steps = max_episode_steps
         self.normalize_advantage = normalize_advantage
+        self.step = step
+        self.target_kl = target_kl
         #: The last rollout; None before the first one, while one is collected, and after an interrupted one
         self.rollout: Rollout | None = None
         #: Whether a rollout is being collected, so that its environments must be left alone
@@ -402,22 +414,23 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
+        # The natural step bounds the policy's change, which the critic's error would be no part of
+        with_values = bool(shared) and self.step == "optimizer"
         log_prob, entropy, values = evaluate(
-            self.policy, route, batch.observations, batch.actions, with_values=bool(shared)
+            self.policy, route, batch.observations, batch.actions, with_values=with_values
         )
         # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
         # (Williams, 1992, equation 4)
         policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
         loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
-        if shared and values is not None:
+        if with_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
             loss = loss + self.vf_coef * F.mse_loss(values, batch.returns)
         grad_norm = 0.0
         # An actor may be frozen while its critic warms up
         if actor and loss.requires_grad:
             gradients = th.autograd.grad(loss, actor, allow_unused=True)
-            with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
-                grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
+            grad_norm = self._step_policy(route, batch, actor, gradients, log_prob.detach())
         # A model that is saved now will be loaded with the temperature of the progress made
         self._apply_temperature_and_floor()
         self._n_updates += 1
@@ -430,6 +443,27 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if batch.values is not None:
             self._train_critic(route, batch, batch.values, critic, bool(shared), critic_rate)
+
+    def _step_policy(
+        self, route: Route, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor
+    ) -> float:
+        """One step against the gradients of the loss; ``log_prob`` is log π before it."""
+        if self.step == "natural":
+            target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
+            # The divergence is one of the policy that acts
+            self.policy.set_training_mode(False)
+            check_distribution(self.policy, batch.observations, batch.actions, log_prob)
+            grad_norm, kl = natural_step(self.policy, batch.observations, actor, gradients, target_kl)
+            self.policy.set_training_mode(True)
+        else:
+            with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
+                grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
+            if route.actor is None:
+                # Another pass over images or sequences would take longer than a log is worth
+                return grad_norm
+            kl = sampled_divergence(self.policy, route, batch.observations, batch.actions, log_prob)
+        self.logger.record("train/kl", kl)
+        return grad_norm
 
     def _train_critic(
         self, route: Route, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float

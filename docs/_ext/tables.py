@@ -8,7 +8,7 @@ import pandas as pd
 RESULTS = Path(__file__).parents[2] / "examples" / "benchmarks" / "results"
 LABELS = {
     "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
-    "reinforce_lstm": "RecurrentREINFORCE", "ppo_lstm": "RecurrentPPO", "vpg": "VPG",
+    "reinforce_lstm": "RecurrentREINFORCE", "ppo_lstm": "RecurrentPPO", "trpo": "TRPO", "vpg": "VPG",
 }  # fmt: skip
 NONE = "–"
 # The task of the README's table for each kind of action, observation and length of episode
@@ -67,6 +67,21 @@ def comparison() -> str:
         cells = [spread(same[same["algorithm"] == name]["return"]) for name in ("reinforce", "a2c", "ppo")]
         lines.append([f"{task} ({short(budget)})", str(runs["seed"].nunique()), *cells, published(task)])
     return markdown(["task (steps)", "seeds", "REINFORCE", "A2C", "PPO", "the Zoo's own, one run each"], lines)
+
+
+def natural() -> str:
+    """The natural step with one setting beside the optimizer's step with each task's, and what the Zoo says of TRPO."""
+    others = final("comparison", "comparison_others")
+    trpo = read("published").query("algorithm == 'trpo'").set_index("task")
+    lines = []
+    for (task, budget), runs in final("natural").groupby(["task", "budget"], sort=False):
+        same = others[(others["task"] == task) & (others["budget"] == budget) & (others["algorithm"] == "reinforce")]
+        theirs = f"{number(trpo['return'][task])} [{short(trpo['timesteps'][task])}]"
+        cells = [spread(runs["return"]), number(runs["cpu_seconds"].median(), 0)]
+        cells += [spread(same["return"]), number(same["cpu_seconds"].median(), 0)]
+        lines.append([f"{task} ({short(budget)})", *cells, theirs])
+    header = ["task (steps)", "natural", "seconds", "optimizer's", "seconds", "TRPO, the Zoo's own, one run"]
+    return markdown(header, lines)
 
 
 def seconds() -> str:
@@ -226,7 +241,7 @@ def processes_model() -> str:
 def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
-        comparison, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars, common_random_numbers,
-        search_throughput, throughput, images, processes, processes_model,
+        comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
+        common_random_numbers, search_throughput, throughput, images, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}

@@ -36,6 +36,7 @@ import rl_zoo3
 import torch as th
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -79,12 +80,13 @@ def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
     return next((published[key] for key in (task, *others, *general) if key in published), None)
 
 
-def make(run: Run) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
+def make(run: Run, params: dict[str, Any] | None = None) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
     """A model, its environments and evaluation environments, with a configuration that no other run shares."""
     with contextlib.redirect_stdout(io.StringIO()):
         manager = (Experiment if run.algorithm in OURS else ExperimentManager)(
-            argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0
-        )
+            argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0,
+            hyperparams=params,
+        )  # fmt: skip
         # Ours are read as by the command train, which leaves out what does not go with the task
         settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
         kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
@@ -133,11 +135,12 @@ class Evaluations(BaseCallback):
         self.since = clocks()
 
 
-def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Exception]:
+def train(final_episodes: int, params: dict[str, Any] | None, run: Run) -> tuple[Run, list[dict[str, Any]] | Exception]:
     """
     Train one model.
 
     :param final_episodes: Episodes of the last evaluation
+    :param params: What replaces the settings of our algorithms
     :param run: Which model
     :return: The run, and one row per evaluation or the error that ended it
     """
@@ -146,7 +149,7 @@ def train(final_episodes: int, run: Run) -> tuple[Run, list[dict[str, Any]] | Ex
     # Ctrl-C is the main process's to answer
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        model, env, eval_env = make(run)
+        model, env, eval_env = make(run, params)
         evaluations = Evaluations(run, env, eval_env)
         model.learn(run.budget, evaluations, log_interval=None)
         if is_leader():
@@ -170,6 +173,7 @@ def main() -> None:
     parser.add_argument("--algorithms", nargs="+", default=ALGORITHMS, choices=list(rl_zoo3.ALGOS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--timesteps", type=int, help="steps per run; the default depends on the task")
+    parser.add_argument("-params", nargs="+", action=StoreDict, help="settings of ours to replace, as for train")
     parser.add_argument("--final-episodes", type=int, default=100)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--output", type=Path, required=True, help="the CSV; rows are added to it")
@@ -202,7 +206,7 @@ def main() -> None:
             map_runs = pool.imap_unordered
         elif not is_leader():
             runs = [run for run in runs if run.algorithm in OURS]
-        results = map_runs(functools.partial(train, arguments.final_episodes), runs)
+        results = map_runs(functools.partial(train, arguments.final_episodes, arguments.params), runs)
         for number, (run, outcome) in enumerate(results, 1):
             minutes = (time.perf_counter() - start) / 60
             left = f"[{number}/{len(runs)}, {minutes:.0f} min, {minutes / number * (len(runs) - number):.0f} left]"

@@ -8,6 +8,8 @@ import torch as th
 
 from sb3_reinforce.common.tensors import to_vector
 
+REMEDY = "a lower learning_rate, a max_grad_norm or scaled rewards (VecNormalize)"
+
 
 def step(
     optimizer: th.optim.Optimizer,
@@ -17,18 +19,24 @@ def step(
     name: str,
 ) -> float:
     """Clip the gradients of a loss to a common norm, descend along them, and return the norm before clipping."""
-    norm = float(th.linalg.vector_norm(to_vector(gradients)))
-    if not math.isfinite(norm):
-        raise ValueError(
-            f"The gradient of the {name} is not finite (norm {norm}). The parameters are those before this step; a "
-            "lower learning_rate, a max_grad_norm or scaled rewards (VecNormalize) may help"
-        )
+    norm = finite_norm(to_vector(gradients), name, REMEDY)
     scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
     optimizer.zero_grad()
     for parameter, gradient in zip(parameters, gradients, strict=True):
         # In the memory layout of its parameter, which a fused optimizer takes for granted
         parameter.grad = None if gradient is None else th.mul(gradient, scale, out=th.empty_like(parameter))
     optimizer.step()
+    return norm
+
+
+def finite_norm(gradient: th.Tensor, name: str, remedy: str) -> float:
+    """The norm of a gradient, which must be finite."""
+    norm = float(th.linalg.vector_norm(gradient))
+    if not math.isfinite(norm):
+        raise ValueError(
+            f"The gradient of the {name} is not finite (norm {norm}). The parameters are those before this step; "
+            f"{remedy} may help"
+        )
     return norm
 
 

@@ -47,7 +47,6 @@ INSTEAD_OF_PPO = {
     "n_epochs": "it takes one policy step per rollout; n_critic_updates is the number of the critic's passes",
     "clip_range": ONE_STEP,
     "clip_range_vf": ONE_STEP,
-    "target_kl": ONE_STEP,
     "use_rms_prop": OPTIMIZER,
     "rms_prop_eps": OPTIMIZER,
 }
@@ -110,6 +109,8 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
     "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
     "normalize_advantage": check_flag,
+    "step": partial(check_choice, choices=("optimizer", "natural")),
+    "target_kl": optional(partial(CheckedSchedule, low=0)),
 }
 FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "estimator": check_name,
@@ -164,6 +165,9 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
         got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
         raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
+    if model.target_kl is not None and model.step != "natural":
+        got = f"target_kl={model.target_kl!r} and step={model.step!r}"
+        raise ValueError(f"target_kl must be None unless step='natural', got {got}")
     if isinstance(model.action_space, spaces.Box):
         if model.temperature != 1:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")

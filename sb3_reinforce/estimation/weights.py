@@ -16,6 +16,9 @@ from sb3_reinforce.common.tensors import select
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
 from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
+# Advantages of less than this part of the return are rounding errors
+ROUNDING = 1e-12
+
 
 def complete_rollout(
     buffer: RolloutBuffer,
@@ -77,7 +80,10 @@ def complete_rollout(
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
     """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
-    advantages = rollout.returns.numpy() - check_baseline(baseline, rollout)
+    returns = rollout.returns.numpy()
+    advantages = returns - check_baseline(baseline, rollout)
+    # Where all returns are equal, their mean differs by rounding, which a natural step would take for a gradient
+    advantages[np.abs(advantages) <= ROUNDING * np.abs(returns)] = 0.0
     return np.where(rollout.used.numpy(), advantages, 0.0).astype(np.float32)
 
 

@@ -142,6 +142,23 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[:2]
 
 
+@th.no_grad()
+def sampled_divergence(
+    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor
+) -> float:
+    """
+    The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
+
+    Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative. NaN if π's outputs are.
+    """
+    try:
+        log_ratio = evaluate(policy, route, obs, actions, with_values=False)[0] - log_prob
+    except ValueError:
+        # PyTorch makes no distribution of outputs that are not finite; the next rollout reports them
+        return math.nan
+    return float((th.expm1(log_ratio) - log_ratio).mean())
+
+
 def split_parameters(
     policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
 ) -> tuple[Parameters, Parameters, Parameters]:

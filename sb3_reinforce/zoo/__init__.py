@@ -15,7 +15,7 @@ except ImportError as error:
         name=__name__,
     ) from error
 
-from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_reinforce.zoo import samplers
 from sb3_reinforce.zoo.experiments import ALGORITHMS, HYPERPARAMS, Experiment, make_experiment
@@ -29,8 +29,8 @@ HYPERPARAMS_SAMPLER.update(
     finite_difference=samplers.sample_finite_difference,
 )
 HYPERPARAMS_CONVERTER.update(
-    reinforce=convert_onpolicy_params,
-    reinforce_lstm=convert_onpolicy_params,
+    reinforce=samplers.convert_reinforce,
+    reinforce_lstm=samplers.convert_reinforce,
     finite_difference=samplers.convert_finite_difference,
 )
 # The command train makes its experiment by this name

@@ -95,7 +95,7 @@ class Experiment(exp_manager.ExperimentManager):
         found.update(self.custom_hyperparams or {})
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
-        check_hyperparams(self.algo, found, self.optimize_hyperparameters)
+        check_hyperparams(self.algo, found)
         for key in ("policy_kwargs", "env_kwargs"):
             self.argument_names |= as_dict(key, found.get(key)).keys()
         saved = OrderedDict(sorted(found.items()))
@@ -196,7 +196,7 @@ def closest(name: str, names: Iterable[str]) -> str:
     return "".join(f": did you mean {near}?" for near in difflib.get_close_matches(name, names, n=1))
 
 
-def check_hyperparams(algorithm: str, hyperparams: Settings, optimize: bool) -> None:
+def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     """Raise an error for settings that the Zoo would fail on; the algorithm checks its own arguments."""
     allowed = allowed_keys(algorithm)
     for key in hyperparams:
@@ -221,11 +221,6 @@ def check_hyperparams(algorithm: str, hyperparams: Settings, optimize: bool) -> 
     for key in ("n_envs", "frame_stack"):
         check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
-    if optimize and (hyperparams.get("n_episodes") or hyperparams.get("baseline", "value") != "value"):
-        raise ConfigurationError(
-            "-optimize samples n_steps and gae_lambda, which need baseline='value' and no n_episodes, got "
-            f"baseline={hyperparams.get('baseline', 'value')!r} and n_episodes={hyperparams.get('n_episodes')!r}"
-        )
 
 
 def as_dict(key: str, value: Any) -> Settings:

@@ -11,21 +11,42 @@ from sb3_reinforce.zoo.experiments import Settings
 
 
 def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
-    """Suggest arguments of REINFORCE with a critic and fixed rollouts; ``policy_kwargs`` replaces a configured one."""
-    arguments: Settings = convert_onpolicy_params(
-        {
-            "n_steps_pow": trial.suggest_int("n_steps_pow", 3, 9),
-            "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 9),
-            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.1, log=True),
-            "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True),
-            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
-            "n_critic_updates": trial.suggest_int("n_critic_updates", 1, 20, log=True),
-            "ent_coef": trial.suggest_float("ent_coef", 1e-8, 0.1, log=True),
-            "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 2.0),
-            "net_arch": trial.suggest_categorical("net_arch", ["tiny", "small", "medium"]),
-            "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
-        }
-    )
+    """Suggest a baseline, a kind of rollout, a kind of step and their settings; ``policy_kwargs`` are replaced."""
+    sampled: Settings = {
+        "baseline": trial.suggest_categorical("baseline", ["value", "leave_one_out", "time_mean", "optimal"]),
+        "step": trial.suggest_categorical("step", ["optimizer", "natural"]),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.1, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
+        "ent_coef": trial.suggest_float("ent_coef", 1e-8, 0.1, log=True),
+        "net_arch": trial.suggest_categorical("net_arch", ["tiny", "small", "medium"]),
+        "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
+    }
+    if sampled["step"] == "natural":
+        sampled["target_kl"] = trial.suggest_float("target_kl", 1e-3, 0.05, log=True)
+    else:
+        sampled["max_grad_norm"] = trial.suggest_float("max_grad_norm", 0.3, 2.0)
+    # Without a critic, an episode that fixed rollouts cut is left out
+    if sampled["baseline"] != "value" or trial.suggest_categorical("whole_episodes", [False, True]):
+        sampled["n_episodes_pow"] = trial.suggest_int("n_episodes_pow", 2, 6)
+    else:
+        low, high = (7, 11) if sampled["step"] == "natural" else (3, 9)
+        sampled["n_steps_pow"] = trial.suggest_int("n_steps_pow", low, high)
+    if sampled["baseline"] == "value":
+        sampled["one_minus_gae_lambda"] = trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True)
+        sampled["batch_size_pow"] = trial.suggest_int("batch_size_pow", 5, 9)
+        sampled["n_critic_updates"] = trial.suggest_int("n_critic_updates", 1, 20, log=True)
+    return convert_reinforce(sampled)
+
+
+def convert_reinforce(sampled_params: Settings) -> Settings:
+    """Convert the values of a trial to arguments of REINFORCE."""
+    arguments: Settings = convert_onpolicy_params({"one_minus_gae_lambda": 0.0, **sampled_params})
+    arguments.pop("whole_episodes", None)
+    # Set in any case, since a configured value may not go with the sampled ones
+    for name in ("n_steps", "n_episodes", "target_kl"):
+        arguments.setdefault(name, None)
+    if "n_episodes_pow" in arguments:
+        arguments["n_episodes"] = 2 ** arguments.pop("n_episodes_pow")
     return arguments
 
 

@@ -198,7 +198,7 @@ def logged(model, folder):
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
 def test_the_log_has_the_keys_of_a2c_and_more(env, tmp_path):
     ours, theirs = (algorithm("MlpPolicy", env, n_steps=64) for algorithm in (REINFORCE, A2C))
-    more = {"train/grad_norm", "rollout/complete_fraction"}
+    more = {"train/grad_norm", "train/kl", "rollout/complete_fraction"}
     assert logged(ours, tmp_path / "ours").keys() == logged(theirs, tmp_path / "theirs").keys() | more
 
 

@@ -227,7 +227,6 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
-        ([*REINFORCE, "-optimize", "-params", "n_episodes:8"], "-optimize samples n_steps"),
         (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
         (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
     ],

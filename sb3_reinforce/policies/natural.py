@@ -1,0 +1,158 @@
+"""
+The natural policy gradient: the direction F⁻¹ g, scaled to a given divergence from the policy that has acted.
+
+F is the Fisher information of the policy at the states of the rollout (Kakade, 2001, "A Natural Policy Gradient";
+Peters and Schaal, 2008, section 4).
+"""
+
+import copy
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.distributions import kl_divergence
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_reinforce.common.optimization import finite_norm
+from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.policies import parameters as vectors
+from sb3_reinforce.policies.evaluation import Parameters, action_distribution
+
+DEFAULT_TARGET_KL = 0.01
+# λ and the number of iterations, as in TRPO (Schulman et al., 2015, appendix C)
+DAMPING = 0.1
+N_ITERATIONS = 10
+# A step whose measured divergence exceeds the target by this factor is shortened, by half at most
+TOLERANCE = 1.2
+MAX_REDUCTIONS = 20
+# The residual, relative to b, at which a system is solved
+PRECISION = 1e-10
+
+
+# cuDNN cannot differentiate the passes of a recurrent policy twice
+@th.backends.cudnn.flags(enabled=False)
+def natural_step(
+    policy: ActorCriticPolicy,
+    obs: Any,
+    parameters: Parameters,
+    gradients: Sequence[th.Tensor | None],
+    target_kl: float,
+    damping: float = DAMPING,
+) -> tuple[float, float]:
+    """
+    ``θ ← θ − α d`` with ``(F + λ I) d = g`` and ``α² dᵀ F d / 2 = target_kl``; returns ‖g‖ and the mean divergence.
+
+    The parameters stay as they are, with a warning, where no such step is found.
+    """
+    pairs = [(each, gradient) for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
+    parameters = [each for each, _ in pairs]
+    g = to_vector([gradient for _, gradient in pairs])
+    norm = finite_norm(g, "policy", "scaled rewards (VecNormalize)")
+    # A schedule may fall to a target of 0
+    if norm == 0 or target_kl == 0:
+        return norm, 0.0
+    divergence = divergence_from_now(policy, obs)
+    fisher_product = hessian_product(divergence(), parameters)
+    d = conjugate_gradients(lambda v: fisher_product(v) + damping * v, g / norm)
+    curvature = float(d @ fisher_product(d))
+    kl = None
+    if 0 < curvature < math.inf:
+        kl = walk(parameters, d, math.sqrt(2 * target_kl / curvature), divergence, target_kl)
+    if kl is None:
+        warnings.warn(
+            "The natural step is left out, and the parameters are those before it: no step was found that changes the "
+            "policy by target_kl. Mostly the policy is almost deterministic; ent_coef, temperature or min_std may help",
+            stacklevel=2,
+        )
+    return norm, kl or 0.0
+
+
+@th.no_grad()
+def check_distribution(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, log_prob: th.Tensor) -> None:
+    """Refuse a policy whose distribution in evaluation mode has another log π than the one that it learns from."""
+    own = action_distribution(policy, obs).log_prob(actions)
+    if not th.allclose(own, log_prob, rtol=1e-3, atol=1e-4):
+        raise ValueError(
+            f"step='natural' needs the distribution of the actions, and get_distribution of {type(policy).__name__} "
+            "does not give the log π that it learns from (dropout, batch normalization, or overridden methods): use "
+            "step='optimizer'"
+        )
+
+
+def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.Tensor]:
+    """A function that returns the mean of KL(π_now(·|s) ‖ π(·|s)) over the observations."""
+
+    def current() -> Any:
+        # The policy has one distribution object, which each evaluation fills
+        return copy.copy(action_distribution(policy, obs))
+
+    with th.no_grad():
+        now = current()
+
+    def divergence() -> th.Tensor:
+        kl = kl_divergence(now, current())
+        return kl.flatten(1).sum(1).mean() if kl.dim() > 1 else kl.mean()
+
+    return divergence
+
+
+def hessian_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
+    """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994)."""
+    slopes = th.autograd.grad(output, parameters, create_graph=True)
+    slope = th.cat([each.flatten() for each in slopes])
+    return lambda v: to_vector(th.autograd.grad(slope @ v, parameters, retain_graph=True))
+
+
+def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor) -> th.Tensor:
+    """x with ``A x ≈ b`` for a positive definite A (Hestenes and Stiefel, 1952), or 0 if A is found to be none."""
+    x = th.zeros_like(b)
+    residual = b
+    direction = b
+    square = b @ b
+    for _ in range(N_ITERATIONS):
+        if square <= PRECISION**2 * (b @ b):
+            break
+        image = product(direction)
+        step = square / (direction @ image)
+        if not 0 < step < math.inf:
+            return th.zeros_like(b)
+        x = x + step * direction
+        residual = residual - step * image
+        next_square = residual @ residual
+        direction = residual + next_square / square * direction
+        square = next_square
+    return x
+
+
+def walk(
+    parameters: Parameters, d: th.Tensor, length: float, divergence: Callable[[], th.Tensor], target_kl: float
+) -> float | None:
+    """``θ − length · d``, shortened until the divergence is at most 1.2 times the target; returns it, or None."""
+    before = to_vector(parameters)
+    kl = math.inf
+    try:
+        for _ in range(MAX_REDUCTIONS):
+            vectors.write(parameters, before - length * d)
+            kl = measured(divergence)
+            if kl <= TOLERANCE * target_kl:
+                return max(kl, 0.0)
+            # The divergence is about quadratic in the length
+            length *= max(0.5, math.sqrt(target_kl / kl))
+            kl = math.inf
+        return None
+    finally:
+        if kl == math.inf:
+            vectors.write(parameters, before)
+
+
+@th.no_grad()
+def measured(divergence: Callable[[], th.Tensor]) -> float:
+    """The divergence, or ∞ where it is not a number."""
+    try:
+        kl = float(divergence())
+    except ValueError:
+        # PyTorch makes no distribution of outputs that are not finite
+        return math.inf
+    return math.inf if math.isnan(kl) else kl

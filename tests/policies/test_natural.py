@@ -1,0 +1,310 @@
+"""The natural step: the direction F⁻¹ g, without damping invariant to the parametrization, as long as KL allows."""
+
+from copy import copy, deepcopy
+
+import numpy as np
+import pytest
+import torch as th
+from enumeration import make_model
+from environments import Corridor
+from gymnasium import spaces
+from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch.distributions import kl_divergence
+
+from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
+from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
+from sb3_reinforce.policies.natural import conjugate_gradients, natural_step, walk
+from sb3_reinforce.recurrent import RecurrentREINFORCE
+
+# The states of the tree, as often as a rollout might visit them
+OBS = th.eye(3)[[0, 0, 0, 1, 2, 2]]
+PARAMETERS = th.tensor([[1.0, -0.3, 0.2], [0.5, 0.1, -0.4]], dtype=th.float64)
+
+
+def fisher(policy, obs):
+    """Σ_s Σ_a π(a|s) ψψᵀ / n with the scores ψ of the weights."""
+    weight = policy.action_net.weight
+    total = 0.0
+    for row in obs:
+        log_probs = policy.get_distribution(row[None]).distribution.logits[0]
+        scores = [th.autograd.grad(each, weight, retain_graph=True)[0].flatten() for each in log_probs]
+        total = total + sum(each.exp().detach() * th.outer(s, s) for each, s in zip(log_probs, scores, strict=True))
+    return total / len(obs)
+
+
+def gradient_in_range(policy, obs):
+    """The gradient of a loss of the usual form, ``−Σ w log π``."""
+    log_probs = policy.get_distribution(obs).distribution.logits
+    weights = th.linspace(-1, 2, 2 * len(obs), dtype=th.float64).reshape(-1, 2)
+    return th.autograd.grad(-(weights * log_probs).sum(), policy.action_net.weight)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_the_direction_is_the_gradient_times_the_inverse_fisher_information(damping):
+    policy = make_model().policy
+    weight = policy.action_net.weight
+    gradients = gradient_in_range(policy, OBS)
+    # A table of logits has as many directions without effect as states
+    matrix = fisher(policy, OBS) + damping * th.eye(6, dtype=th.float64)
+    expected = -th.linalg.pinv(matrix) @ gradients[0].flatten()
+    before = to_vector([weight])
+    natural_step(policy, OBS, [weight], gradients, 0.01, damping)
+    moved = to_vector([weight]) - before
+    th.testing.assert_close(moved / moved.norm(), expected / expected.norm(), rtol=0, atol=1e-8)
+
+
+def test_the_step_does_not_depend_on_the_parametrization():
+    """Features M x and weights W M⁻¹ are the same policy; so they are after the step, but not after a plain one."""
+    mix = th.tensor([[2.0, 0.3, 0.0], [-0.5, 0.4, 1.0], [0.1, 0.0, 5.0]])
+    logits = {}
+    for natural in (True, False):
+        for name, features in {"x": OBS, "M x": OBS @ mix.T}.items():
+            policy = make_model().policy
+            weight = policy.action_net.weight
+            if name == "M x":
+                with th.no_grad():
+                    weight.copy_(weight @ th.linalg.inv(mix.double()))
+            gradients = gradient_in_range(policy, features)
+            if natural:
+                natural_step(policy, features, [weight], gradients, 0.01, damping=0.0)
+            else:
+                with th.no_grad():
+                    weight -= 0.1 * gradients[0]
+            logits[natural, name] = policy.get_distribution(features).distribution.logits.detach()
+    th.testing.assert_close(logits[True, "x"], logits[True, "M x"], rtol=0, atol=1e-6)
+    assert (logits[False, "x"] - logits[False, "M x"]).abs().max() > 0.01
+
+
+class Divergences(BaseCallback):
+    """Measures how far each update moves the policy: KL(π_before ‖ π_after) at the states of its rollout."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+        self.logged = []
+        self.before = None
+
+    def _on_step(self):
+        return True
+
+    def measure(self):
+        if self.before is not None:
+            policy = self.model.policy
+            before, obs, actions = self.before
+            after = deepcopy(policy.state_dict())
+            with th.no_grad():
+                new = copy(action_distribution(policy, obs))
+                policy.load_state_dict(before)
+                old = action_distribution(policy, obs)
+            kl = 0.0
+            for p, q in zip(independent(old), independent(new), strict=True):
+                kl = kl + kl_divergence(p, q).reshape(len(actions), -1).sum(1)
+            policy.load_state_dict(after)
+            self.found.append(float(kl.mean()))
+            self.logged.append(self.model.logger.name_to_value["train/kl"])
+
+    _on_rollout_start = _on_training_end = measure
+
+    def _on_rollout_end(self):
+        rollout = self.model.rollout
+        obs = select(rollout.inputs, rollout.used)
+        self.before = deepcopy(self.model.policy.state_dict()), obs, select(rollout.actions, rollout.used)
+
+
+def independent(distribution):
+    """The distributions of PyTorch whose product it is."""
+    inner = distribution.distribution
+    return inner if isinstance(inner, list) else [inner]
+
+
+def divergences_of(model, total_timesteps):
+    callback = Divergences()
+    model.learn(total_timesteps, callback, log_interval=None)
+    np.testing.assert_allclose(callback.logged, callback.found, rtol=1e-3, atol=1e-6)
+    return np.array(callback.found)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize("target_kl", [None, 0.003])
+def test_the_measured_divergence_is_the_target(env_id, target_kl):
+    env = make_vec_env(env_id, 8, seed=0)
+    model = REINFORCE("MlpPolicy", env, step="natural", target_kl=target_kl, n_steps=128, seed=0)
+    found = divergences_of(model, 8 * 1024)
+    assert len(found) == 8
+    np.testing.assert_allclose(found, target_kl or 0.01, rtol=0.2)
+
+
+MODELS = {
+    "Discrete": lambda **kwargs: REINFORCE("MlpPolicy", sums(spaces.Discrete(3, start=1)), **kwargs),
+    "MultiDiscrete": lambda **kwargs: REINFORCE("MlpPolicy", sums(spaces.MultiDiscrete([2, 3])), **kwargs),
+    "MultiBinary": lambda **kwargs: REINFORCE("MlpPolicy", sums(spaces.MultiBinary(4)), **kwargs),
+    "Box": lambda **kwargs: REINFORCE("MlpPolicy", sums(spaces.Box(-1, 1, (2,))), **kwargs),
+    "gSDE": lambda **kwargs: REINFORCE("MlpPolicy", sums(spaces.Box(-1, 1, (2,))), use_sde=True, **kwargs),
+    "squashed": lambda **kwargs: REINFORCE(
+        "MlpPolicy",
+        sums(spaces.Box(-1, 1, (2,))),
+        use_sde=True,
+        policy_kwargs=dict(squash_output=True),
+        **kwargs,
+    ),
+    "images": lambda **kwargs: REINFORCE("CnnPolicy", FakeImageEnv(screen_height=40, screen_width=40), **kwargs),
+    "masks": lambda **kwargs: REINFORCE(
+        MaskedPolicy, ActionMaskObservation(InvalidActionEnvMultiDiscrete([3, 4], n_invalid_actions=3)), **kwargs
+    ),
+    "memory": lambda **kwargs: RecurrentREINFORCE("MlpLstmPolicy", sums(spaces.Discrete(3)), **kwargs),
+}
+
+
+def sums(action_space):
+    return Corridor((5,), lambda t, action: float(np.sum(action)), action_space)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_kind_of_policy_takes_it(name):
+    model = MODELS[name](step="natural", n_steps=40, seed=0)
+    before = to_vector(model.policy.parameters())
+    found = divergences_of(model, 120)
+    assert len(found) == 3
+    assert (found > 0.5 * 0.01).all() and (found <= 1.2 * 0.01).all()
+    assert not th.equal(to_vector(model.policy.parameters()), before)
+
+
+def test_where_no_step_is_possible_the_parameters_stay():
+    policy = make_model().policy
+    weight = policy.action_net.weight
+    before = weight.detach().clone()
+    with pytest.raises(ValueError, match="gradient of the policy is not finite"):
+        natural_step(policy, OBS, [weight], [th.full_like(weight, th.nan)], 0.01)
+    assert natural_step(policy, OBS, [weight], [th.zeros_like(weight)], 0.01) == (0.0, 0.0)
+    assert th.equal(weight, before)
+    with th.no_grad():
+        # No action but the first one has a probability, so that no small step changes the policy
+        weight.copy_(th.tensor([[1e4], [-1e4]]))
+    before = weight.detach().clone()
+    with pytest.warns(UserWarning, match="natural step is left out"):
+        natural_step(policy, OBS, [weight], [th.ones_like(weight)], 0.01)
+    assert th.equal(weight, before)
+
+
+@pytest.mark.parametrize("answer", [np.inf, np.nan, ValueError("not finite")])
+def test_a_step_that_cannot_be_measured_is_taken_back(answer):
+    weight = th.nn.Parameter(th.ones(3))
+
+    def divergence():
+        if isinstance(answer, Exception):
+            raise answer
+        return th.tensor(answer)
+
+    assert walk([weight], th.ones(3), 1.0, divergence, 0.01) is None
+    assert th.equal(weight, th.ones(3))
+
+
+def test_after_an_error_the_parameters_are_those_before():
+    weight = th.nn.Parameter(th.ones(3))
+
+    def divergence():
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        walk([weight], th.ones(3), 1.0, divergence, 0.01)
+    assert th.equal(weight, th.ones(3))
+
+
+@pytest.mark.parametrize("matrix", [th.diag(th.tensor([1.0, -1.0])), th.full((2, 2), th.nan)])
+def test_an_indefinite_system_has_no_direction(matrix):
+    assert not conjugate_gradients(lambda v: matrix @ v, th.tensor([1.0, 0.5])).any()
+
+
+def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
+    """The divergence of a policy that is almost deterministic grows faster than the square of the step."""
+    weight = th.nn.Parameter(th.zeros(1))
+    kl = walk([weight], th.ones(1), 10.0, lambda: (weight**8).sum(), 0.01)
+    assert 0.01 / 2**8 <= kl <= 0.012
+
+
+class Scaled(ActorCriticPolicy):
+    """Learns from other features than ``get_distribution`` sees."""
+
+    def extract_features(self, obs, features_extractor=None):
+        return 5 * super().extract_features(obs, features_extractor)
+
+    def get_distribution(self, obs):
+        return super().get_distribution(obs / 5)
+
+
+def test_a_policy_with_another_distribution_is_refused():
+    model = REINFORCE(Scaled, "CartPole-v1", step="natural", n_steps=32, seed=0)
+    before = to_vector(model.policy.parameters())
+    with pytest.raises(ValueError, match="get_distribution of Scaled does not give the log π"):
+        model.learn(32)
+    assert th.equal(to_vector(model.policy.parameters()), before)
+
+
+def test_equal_returns_are_no_gradient():
+    """The mean of equal returns may differ from them by rounding."""
+    env = DummyVecEnv([lambda: Corridor((3,), lambda t, action: 0.1 + 0.1 * t)] * 3)
+    model = REINFORCE("MlpPolicy", env, step="natural", baseline="leave_one_out", n_episodes=6, seed=0)
+    assert divergences_of(model, 18) == [0.0]
+
+
+def test_the_critic_does_not_move_shared_features():
+    features = []
+    for vf_coef in (0.0, 9.0):
+        env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1)
+        env.observation_space.seed(0)
+        model = REINFORCE("CnnPolicy", env, step="natural", n_steps=32, vf_coef=vf_coef, seed=0).learn(32)
+        features.append(to_vector(model.policy.features_extractor.parameters()))
+    assert th.equal(*features)
+
+
+def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
+    policy = make_model().policy
+    route = route_of(policy)
+    with th.no_grad():
+        old = policy.get_distribution(OBS).distribution.logits.clone()
+        policy.action_net.weight.copy_(PARAMETERS)
+        new = policy.get_distribution(OBS).distribution.logits.clone()
+    expected = (old.exp() * (old - new)).sum(1).mean()
+    # Each action as often as the old policy takes it
+    found = 0.0
+    for i in range(len(OBS)):
+        for action in range(2):
+            k3 = sampled_divergence(policy, route, OBS[i : i + 1], th.tensor([action]), old[i, action])
+            found += float(old[i, action].exp()) * k3 / len(OBS)
+    assert found == pytest.approx(float(expected), rel=1e-10)
+
+
+def test_arguments():
+    with pytest.raises(ValueError, match="step must be one of 'optimizer', 'natural', got 'adam'"):
+        REINFORCE("MlpPolicy", "CartPole-v1", step="adam")
+    with pytest.raises(ValueError, match="target_kl must be None unless step='natural', got target_kl="):
+        REINFORCE("MlpPolicy", "CartPole-v1", target_kl=0.01)
+    with pytest.raises(ValueError, match="target_kl must be"):
+        REINFORCE("MlpPolicy", "CartPole-v1", step="natural", target_kl=-0.1)
+
+
+def test_a_target_may_fall_to_0(recwarn):
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    schedule = LinearSchedule(0.02, 0.0, 1.0)
+    model = REINFORCE("MlpPolicy", env, step="natural", target_kl=schedule, n_steps=64, seed=0)
+    found = divergences_of(model, 256)
+    np.testing.assert_allclose(found, [0.01, 0.0], rtol=0.2)
+    assert not recwarn
+
+
+def test_a_saved_model_goes_on_with_its_schedule(tmp_path):
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    schedule = LinearSchedule(0.011, 0.001, 1.0)
+    model = REINFORCE("MlpPolicy", env, step="natural", target_kl=schedule, n_steps=64, seed=0).learn(128)
+    model.save(tmp_path / "model")
+    loaded = REINFORCE.load(tmp_path / "model", env=env)
+    assert loaded.step == "natural"
+    found = divergences_of(loaded, 256)
+    np.testing.assert_allclose(found, [0.006, 0.001], rtol=0.2)
