@@ -71,29 +71,25 @@ def comparison() -> str:
 
 def natural() -> str:
     """The natural step with one setting beside the optimizer's step with each task's, and what the Zoo says of TRPO."""
-    others = final("comparison", "comparison_others")
     trpo = read("published").query("algorithm == 'trpo'").set_index("task")
     lines = []
-    for (task, budget), runs in final("natural").groupby(["task", "budget"], sort=False):
-        same = others[(others["task"] == task) & (others["budget"] == budget) & (others["algorithm"] == "reinforce")]
+    for (task, budget), runs in read("natural").groupby(["task", "budget"], sort=False):
+        cells = []
+        for step in ("natural", "optimizer"):
+            cells.append(spread(runs[runs["step"] == step]["return"]))
         theirs = f"{number(trpo['return'][task])} [{short(trpo['timesteps'][task])}]"
-        cells = [spread(runs["return"]), number(runs["cpu_seconds"].median(), 0)]
-        cells += [spread(same["return"]), number(same["cpu_seconds"].median(), 0)]
         lines.append([f"{task} ({short(budget)})", *cells, theirs])
-    header = ["task (steps)", "natural", "seconds", "optimizer's", "seconds", "TRPO, the Zoo's own, one run"]
+    header = ["task (steps)", "natural step", "optimizer's step", "TRPO, the Zoo's own, one run"]
     return markdown(header, lines)
 
 
 def seconds() -> str:
     """The seconds of a core that the same runs took."""
-    rows = final("comparison", "comparison_others")
+    rows = final("comparison")
     lines = []
     for task, runs in rows[rows["algorithm"].isin(["reinforce", "a2c", "ppo"])].groupby("task", sort=False):
         medians = runs.groupby("algorithm")["cpu_seconds"].median()
-        # One algorithm alone has no one to be compared with
-        if len(medians) > 1:
-            cells = [number(medians[name], 0) if name in medians else NONE for name in ("reinforce", "a2c", "ppo")]
-            lines.append([task, *cells])
+        lines.append([task, *(number(medians[name], 0) for name in ("reinforce", "a2c", "ppo"))])
     return markdown(["task", "REINFORCE", "A2C", "PPO"], lines)
 
 

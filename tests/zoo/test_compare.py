@@ -93,7 +93,10 @@ def test_models_have_the_settings_that_train_would_read(tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "HYPERPARAMS", tmp_path)
     model = compare.make(compare.Run("CartPole-v1", "reinforce", 0, 600))[0]
     assert model.temperature(0.25) == 0.25 and model.ent_coef(0.5) == 0.05
-    assert compare.make(compare.Run("Pendulum-v1", "reinforce", 0, 600))[0].temperature == 1.0
+    pendulum = compare.Run("Pendulum-v1", "reinforce", 0, 600)
+    assert compare.make(pendulum)[0].temperature == 1.0
+    replaced = compare.make(pendulum, {"ent_coef": 0.5, "step": "natural"})[0]
+    assert replaced.step == "natural" and replaced.ent_coef == 0.5
 
 
 def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(tmp_path, plots, monkeypatch, capsys):
