@@ -26,6 +26,7 @@ BUDGETS = {
     "enjoy": "--no-render -n 50",
     "images.py": "--n-envs 1 --timesteps 32 --rounds 1",
     "masks.py": "--seeds 0 --evaluate-at 256",
+    "peers.py": "--contenders REINFORCE --seeds 0 --timesteps 600",
     "record_video": "-n 20",
     "scaling.py": "--n-envs 64 --timesteps 64 --rounds 1",
     "search_throughput.py": "--n-envs 2 --n-delta 2 --updates 1 --rounds 1",

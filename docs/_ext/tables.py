@@ -74,13 +74,11 @@ def natural() -> str:
     trpo = read("published").query("algorithm == 'trpo'").set_index("task")
     lines = []
     for (task, budget), runs in read("natural").groupby(["task", "budget"], sort=False):
-        cells = []
-        for step in ("natural", "optimizer"):
-            cells.append(spread(runs[runs["step"] == step]["return"]))
-        theirs = f"{number(trpo['return'][task])} [{short(trpo['timesteps'][task])}]"
+        returns = [runs[runs["step"] == step]["return"] for step in ("natural", "optimizer")]
+        cells = [f"{spread(values)} [{len(values)}]" for values in returns]
+        theirs = f"{number(trpo['return'][task])} [1, {short(trpo['timesteps'][task])}]"
         lines.append([f"{task} ({short(budget)})", *cells, theirs])
-    header = ["task (steps)", "natural step", "optimizer's step", "TRPO, the Zoo's own, one run"]
-    return markdown(header, lines)
+    return markdown(["task (steps)", "natural step [seeds]", "optimizer's step", "TRPO, the Zoo's own"], lines)
 
 
 def seconds() -> str:
@@ -205,6 +203,17 @@ def throughput() -> str:
     return markdown(["environments", *(name.replace("raw", "VecEnv") for name in rows.columns[2:])], lines)
 
 
+def peers() -> str:
+    """Speed as ratios of the same seed, and what it takes to the return: medians of the seeds."""
+    rows = read("peers")
+    rates = rows.pivot(index="seed", columns="contender", values="rate")
+    lines = []
+    for name, runs in rows.groupby("contender", sort=False):
+        ratio = (rates["REINFORCE"] / rates[name]).median()
+        lines.append([name, f"{ratio:.1f}", *(number(runs[column].median(), 0) for column in ("steps", "seconds"))])
+    return markdown(["", "REINFORCE's steps per second / its own", "steps to the return", "seconds of a core"], lines)
+
+
 def images() -> str:
     """Steps a second from images beside A2C, for each number of environments."""
     texts = [f"{row['REINFORCE / A2C']:.2f}" for _, row in read("images").iterrows()]
@@ -238,6 +247,6 @@ def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
         comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
-        common_random_numbers, search_throughput, throughput, images, processes, processes_model,
+        common_random_numbers, search_throughput, throughput, images, peers, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}
