@@ -26,7 +26,7 @@ def test_to_repeat_the_observation(env_class, baseline):
     model = REINFORCE(
         "MlpPolicy", env, baseline=baseline, gamma=0.4, learning_rate=5e-3, seed=0, normalize_advantage=True, **mode,
         policy_kwargs={"log_std_init": -0.5} if box else {}, device="cpu",
-    ).learn(12_000)  # fmt: skip
+    ).learn(8_000)  # fmt: skip
     mean, _ = evaluate_policy(model, env, n_eval_episodes=10, warn=False)
     assert mean >= 90
 
@@ -46,7 +46,9 @@ def score(model, seed):
     return evaluate_policy(model, make_vec_env("CartPole-v1", 5, seed=2000 + seed), n_eval_episodes=100)[0]
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3, 4))])
+# ``examples/1_reinforce.py``, which CI runs, asserts the same for one seed
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
 def test_cart_pole_is_solved(seed):
     model = train_on_cart_pole(seed)
     assert model.num_timesteps <= 150_000 and score(model, seed) >= 475
