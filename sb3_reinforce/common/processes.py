@@ -12,7 +12,8 @@ import socket
 import time
 from contextlib import suppress
 from datetime import timedelta
-from multiprocessing.connection import Connection, wait
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Client, Listener, wait
 from typing import Any, cast
 
 import torch.distributed as dist
@@ -21,9 +22,6 @@ from sb3_reinforce.common.interruptions import uninterrupted
 
 # With the value 0, each process learns alone
 SWITCH = "SB3_REINFORCE_PROCESSES"
-# All processes connect within the first time, and each sends its key within the second
-CONNECT_SECONDS = 60.0
-KEY_SECONDS = 5.0
 # Within these times the cause of a signal arrives, and torchrun's SIGTERM after another process has ended
 CAUSE_SECONDS = 0.5
 SIGTERM_SECONDS = 5.0
@@ -79,42 +77,29 @@ class Processes:
 
     def connect(self) -> None:
         """Connect process 0 with each other process, which proves by a key that it belongs to the group."""
-        # The time begins when all have called learn()
+        # Nobody waits for a connection before all have called learn()
         dist.barrier()
         invitation: list[Any] = [None]
-        if self.rank == 0:
-            server = socket.create_server(("", 0), backlog=self.size)
-            host = os.environ.get("MASTER_ADDR") or socket.gethostname()
-            invitation = [(host, server.getsockname()[1], secrets.token_bytes(32))]
-        dist.broadcast_object_list(invitation, src=0)
-        host, port, key = invitation[0]
         if self.rank > 0:
-            line = socket.create_connection((host, port), CONNECT_SECONDS)
-            line.sendall(key + self.rank.to_bytes(4, "big"))
-            self.add(line, 0)
-            return
-        end = time.monotonic() + CONNECT_SECONDS
-        with server:
-            while missing := {*range(1, self.size)} - {*self.lines.values()}:
-                left = end - time.monotonic()
-                if left <= 0:
-                    message = f"Process {min(missing)} has not connected to {host}:{port} within {CONNECT_SECONDS:g} s"
-                    raise ProcessError(message)
-                server.settimeout(left)
-                # A stranger may have found the port
-                with suppress(OSError):
-                    line, _ = server.accept()
-                    line.settimeout(KEY_SECONDS)
-                    sent = line.recv(len(key) + 4)
-                    if secrets.compare_digest(sent[:-4], key):
-                        self.add(line, int.from_bytes(sent[-4:], "big"))
-
-    def add(self, line: socket.socket, rank: int) -> None:
-        """Send and receive messages by a socket."""
-        line.settimeout(None)
-        # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.lines[Connection(line.detach())] = rank
+            dist.broadcast_object_list(invitation, src=0)
+            *address, key = invitation[0]
+            line = Client(tuple(address), authkey=key)
+            line.send(self.rank)
+            self.lines[line] = 0
+        else:
+            key = secrets.token_bytes(32)
+            with Listener(("", 0), backlog=self.size, authkey=key) as listener:
+                host = os.environ.get("MASTER_ADDR") or socket.gethostname()
+                dist.broadcast_object_list([(host, listener.address[1], key)], src=0)
+                while len(self.lines) < self.size - 1:
+                    # A stranger may have found the port
+                    with suppress(AuthenticationError, EOFError, OSError):
+                        line = listener.accept()
+                        self.lines[line] = line.recv()
+        for line in self.lines:
+            with socket.fromfd(line.fileno(), socket.AF_INET, socket.SOCK_STREAM) as duplicate:
+                # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
+                duplicate.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: Any) -> None:
         """Send to all others, or to process 0; the next ``receive`` names a process that this does not reach."""
