@@ -5,14 +5,10 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
+from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import (
-    ActorCriticCnnPolicy,
-    ActorCriticPolicy,
-    BasePolicy,
-    MultiInputActorCriticPolicy,
-)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
@@ -94,9 +90,7 @@ class FiniteDifference(BasePolicyGradient):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "LinearPolicy": LinearPolicy,
-        "MlpPolicy": ActorCriticPolicy,
-        "CnnPolicy": ActorCriticCnnPolicy,
-        "MultiInputPolicy": MultiInputActorCriticPolicy,
+        **A2C.policy_aliases,
         "MaskedPolicy": MaskedPolicy,
     }
     policy: ActorCriticPolicy
