@@ -35,7 +35,8 @@ from sb3_reinforce.estimation.perturbations import (
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.sampling.utility import Stopped, episodic_utility
+from sb3_reinforce.sampling.normalization import frozen
+from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -271,7 +272,8 @@ class FiniteDifference(BasePolicyGradient):
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
-            with episodic_utility(self, searched, callback, first_seed) as utility:
+            with frozen(self.get_vec_normalize_env()) as observed:
+                utility = EpisodicUtility(self, searched, callback, observed, first_seed)
                 gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
