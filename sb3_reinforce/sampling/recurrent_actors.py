@@ -12,10 +12,9 @@ from torch import nn
 from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import (
     HOOKS,
-    ONE_THREAD,
-    Floats,
     has_numpy_form,
     is_unchanged,
+    numpy_forward,
     plain_actor,
     takes_vectors,
 )
@@ -94,13 +93,10 @@ class LstmCell:
 
     def __init__(self, lstm: Any, state: th.Tensor):
         self.hidden, self.cell = (half.numpy().copy() for half in state[:, :, 0].unbind(1))
-        self.weights = [parameter.detach().T for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
-        is_small = len(state) * max(weight.numel() for weight in self.weights) <= ONE_THREAD
-        self.multiply = by_numpy if is_small else by_torch
-        self.biases = [parameter.detach().numpy() for parameter in (lstm.bias_ih_l0, lstm.bias_hh_l0)]
-        n_hidden = lstm.hidden_size
+        self.from_obs = numpy_forward([linear_of(lstm.weight_ih_l0, lstm.bias_ih_l0)], len(state))
+        self.from_hidden = numpy_forward([linear_of(lstm.weight_hh_l0, lstm.bias_hh_l0)], len(state))
         # σ(x) = ½ tanh(½ x) + ½ for three gates, and tanh itself for g
-        self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), n_hidden)
+        self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), lstm.hidden_size)
         self.shift = 1 - self.scale
 
     @np.errstate(all="ignore")
@@ -114,24 +110,19 @@ class LstmCell:
         if np.count_nonzero(starts):
             self.hidden[starts] = 0
             self.cell[starts] = 0
-        x = obs.reshape(len(starts), -1).astype(np.float32, copy=False)
-        gates = self.multiply(x, self.weights[0]) + self.multiply(self.hidden, self.weights[1])
-        gates += self.biases[0]
-        gates += self.biases[1]
+        gates = self.from_obs(obs) + self.from_hidden(self.hidden)
         i, f, g, o = np.split(np.tanh(gates * self.scale) * self.scale + self.shift, 4, axis=1)
         self.cell = f * self.cell + i * g
         self.hidden = o * np.tanh(self.cell)
         return self.hidden
 
 
-def by_numpy(x: Floats, weight: th.Tensor) -> Any:
-    """``x W``."""
-    return np.dot(x, weight.numpy())
-
-
-def by_torch(x: Floats, weight: th.Tensor) -> Any:
-    """``x W``, with as many threads as the user has set for PyTorch."""
-    return th.mm(th.from_numpy(x), weight).numpy()
+def linear_of(weight: nn.Parameter, bias: nn.Parameter) -> nn.Linear:
+    """A linear layer with given parameters."""
+    layer: nn.Linear = nn.utils.skip_init(nn.Linear, *reversed(weight.shape))  # type: ignore[no-untyped-call]
+    layer.weight = weight
+    layer.bias = bias
+    return layer
 
 
 RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor
