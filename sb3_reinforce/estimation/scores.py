@@ -49,26 +49,21 @@ def gradients_by_episode(
     """
     parameters = scored_parameters(rollout)
     w = th.stack([select(weight, rollout.used) for weight in weights]).to(parameters[0])
-    obs = select(rollout.inputs, rollout.used)
-    actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
     _, rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)
     n = len(range(sum(parameter.numel() for parameter in parameters))[columns])
     result = w.new_zeros(len(w), int(rank.max()) + 1, n)
-    for episode, gradients in episode_sums(rollout.policy, parameters, obs, actions, w, rank, chunk):
+    for episode, gradients in episode_sums(rollout, parameters, w, rank, chunk):
         result[:, episode] += gradients[:, columns]
     return result
 
 
 def episode_sums(
-    policy: ActorCriticPolicy,
-    parameters: Parameters,
-    obs: PyTorchObs,
-    actions: th.Tensor,
-    w: th.Tensor,
-    rank: th.Tensor,
-    chunk: int,
+    rollout: Rollout, parameters: Parameters, w: th.Tensor, rank: th.Tensor, chunk: int
 ) -> Iterator[tuple[int, th.Tensor]]:
     """Episodes, each with ``Σ_t w_t ∇ log π`` over some of its steps, shape ``(k, n)``, for k weights of all steps."""
+    policy = rollout.policy
+    obs = select(rollout.inputs, rollout.used)
+    actions = as_policy_actions(select(rollout.actions, rollout.used), policy.action_space)
     layers = factored_layers(policy)
     if layers is None:
         for episode, steps in enumerate(steps_of(rank)):
