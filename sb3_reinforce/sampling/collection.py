@@ -67,9 +67,8 @@ class Extent:
         counted = np.flatnonzero(dones & (self.remaining > 0))
         self.remaining[counted] -= 1
         self.starts[counted] = n_steps
-        if self.n_steps == np.inf:
-            self.is_complete = not self.remaining.any()
-            self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
+        self.is_complete = not self.remaining.any()
+        self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
         return list(counted.tolist())
 
 
