@@ -13,6 +13,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
+from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
 from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
@@ -157,11 +158,6 @@ def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
             f"baseline must return a tensor of shape (n_steps, n_envs) = {tuple(rollout.returns.shape)}, got "
             f"{tuple(baseline.shape)}"
         )
-    values = baseline.detach().cpu().double().numpy()
-    wrong = np.argwhere(~np.isfinite(values) & rollout.used.numpy())
-    if len(wrong):
-        step, env = wrong[0]
-        raise ValueError(
-            f"baseline must return finite values, got {values[step, env]} at step {step} of environment {env}"
-        )
-    return np.where(rollout.used.numpy(), values, 0.0)
+    values: Floats = np.where(rollout.used.numpy(), baseline.detach().cpu().double().numpy(), 0.0)
+    check_finite("The baseline", values)
+    return values
