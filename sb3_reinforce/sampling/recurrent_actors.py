@@ -11,7 +11,6 @@ from torch import nn
 
 from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import (
-    HOOKS,
     has_numpy_form,
     is_unchanged,
     numpy_forward,
@@ -29,12 +28,11 @@ Starts: TypeAlias = Callable[[], Bools]
 class RecurrentPolicyActor(PolicyActor):
     """Acts by the policy's own methods, from a state of shape ``(n_envs, 2, n_layers, n_hidden)``."""
 
-    def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool):
+    def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool):
         super().__init__(policy, route_of(policy))
         self.starts = starts
-        self.keep_outputs = keep_outputs
+        self.with_log_prob = with_log_prob
         self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
-        self.log_probs: list[np.ndarray] = []
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
@@ -45,13 +43,9 @@ class RecurrentPolicyActor(PolicyActor):
             obs_as_tensor(obs, policy.device), self.halves, episode_starts
         )
         actions = distribution.get_actions()
-        if self.keep_outputs:
-            self.log_probs.append(distribution.log_prob(actions).cpu().numpy())
-        return actions.cpu().numpy().reshape(-1, *self.shape), None, None
-
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
-        """log π of the steps, as they were drawn, shape ``(n_steps * n_envs,)``."""
-        return np.concatenate(self.log_probs)
+        # Not in one batch after the rollout, for which the memory would be computed again
+        log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
+        return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
 
     def state(self) -> th.Tensor:
         """The actor's state after its last step, shape ``(n_envs, 2, n_layers, n_hidden)``."""
@@ -66,15 +60,13 @@ class LstmActor(NumpyActor):
     """Acts by NumPy, for an LSTM of one layer between flat observations and a plain MLP."""
 
     def __init__(
-        self, policy: RecurrentPolicy, layers: list[nn.Module], state: th.Tensor, starts: Starts, keep_outputs: bool
+        self, policy: RecurrentPolicy, layers: list[nn.Module], state: th.Tensor, starts: Starts, with_log_prob: bool
     ):
-        super().__init__(policy, layers, len(state), keep_outputs)
+        super().__init__(policy, layers, len(state), with_log_prob, policy.lstm_actor)
         self.starts = starts
         self.lstm = policy.lstm_actor
         self.cell = LstmCell(self.lstm, state)
         self.lstm_addresses = [parameter.data_ptr() for parameter in self.lstm.parameters()]
-        self.dicts += [vars(self.lstm), *(vars(self.lstm)[name] for name in HOOKS)]
-        self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
         return super().act(self.cell.step(obs, self.starts()))
@@ -129,13 +121,13 @@ RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor
 
 
 def make_recurrent_actor(
-    policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool
+    policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool
 ) -> RecurrentActor:
     """The fastest actor that acts as the policy would."""
     layers = make_head(policy)
     if layers is not None:
-        return LstmActor(policy, layers, state, starts, keep_outputs)
-    return RecurrentPolicyActor(policy, state, starts, keep_outputs)
+        return LstmActor(policy, layers, state, starts, with_log_prob)
+    return RecurrentPolicyActor(policy, state, starts, with_log_prob)
 
 
 def make_head(policy: Any) -> list[nn.Module] | None:
