@@ -5,14 +5,10 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
+from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import (
-    ActorCriticCnnPolicy,
-    ActorCriticPolicy,
-    BasePolicy,
-    MultiInputActorCriticPolicy,
-)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
@@ -39,7 +35,8 @@ from sb3_reinforce.estimation.perturbations import (
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.sampling.utility import Stopped, episodic_utility
+from sb3_reinforce.sampling.normalization import frozen
+from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
 
@@ -94,9 +91,7 @@ class FiniteDifference(BasePolicyGradient):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "LinearPolicy": LinearPolicy,
-        "MlpPolicy": ActorCriticPolicy,
-        "CnnPolicy": ActorCriticCnnPolicy,
-        "MultiInputPolicy": MultiInputActorCriticPolicy,
+        **A2C.policy_aliases,
         "MaskedPolicy": MaskedPolicy,
     }
     policy: ActorCriticPolicy
@@ -277,7 +272,8 @@ class FiniteDifference(BasePolicyGradient):
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
-            with episodic_utility(self, searched, callback, first_seed) as utility:
+            with frozen(self.get_vec_normalize_env()) as observed:
+                utility = EpisodicUtility(self, searched, callback, observed, first_seed)
                 gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")

@@ -136,7 +136,7 @@ class RecurrentREINFORCE(REINFORCE):
         self._next_state = self._state_after_rollout() if is_complete and n_rollout_steps is not None else None
         return is_complete
 
-    def _make_actor(self, route: Route, keep_outputs: bool) -> RecurrentActor:
+    def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
         policy = cast(RecurrentPolicy, self.policy)
         if self._actor is not None:
             # A callback has changed the policy during the rollout
@@ -147,7 +147,7 @@ class RecurrentREINFORCE(REINFORCE):
             if self._next_state is not None and not starts.all():
                 self._state = self._next_state[: self.n_envs] * ~starts[(...,) + (None,) * 4]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
-        self._actor = make_recurrent_actor(policy, state, self._episode_starts, keep_outputs)
+        self._actor = make_recurrent_actor(policy, state, self._episode_starts, with_log_prob)
         return self._actor
 
     def _episode_starts(self) -> Bools:

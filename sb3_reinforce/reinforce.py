@@ -388,8 +388,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def collect_part(self, callback: BaseCallback) -> None:
         self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
 
-    def _make_actor(self, route: Route, keep_outputs: bool) -> Actor:
-        return make_actor(self.policy, route, self.n_envs, keep_outputs)
+    def _make_actor(self, route: Route, with_log_prob: bool) -> Actor:
+        return make_actor(self.policy, route, self.n_envs, with_log_prob)
 
     def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 
 class Tree(gym.Env[np.ndarray, np.int64]):
@@ -178,3 +179,20 @@ class Faulty(Corridor):
             os.kill(os.getppid(), signal.Signals[self.fault])
             # The answer comes when the learner has long stopped waiting for it
             time.sleep(0.2)
+
+
+class Reused(VecEnvWrapper):
+    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.dones = getattr(self, "dones", np.zeros(self.num_envs, dtype=np.uint8))
+        self.dones[:] = dones
+        self.last = getattr(self, "last", np.zeros_like(obs))
+        for i in np.flatnonzero(dones):
+            self.last[i] = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = self.last[i]
+        return obs, rewards, self.dones, infos

@@ -90,11 +90,10 @@ class Running:
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
     def unless(self, starts: Bools) -> "Running":
-        """The episodes that go on where none ``starts``, without the episodes of further environments."""
-        n_envs = len(starts)
-        if starts.all():
-            return Running.none(n_envs)
-        return Running(np.where(starts, 0, self.timesteps[:n_envs]), np.where(starts, 0.0, self.rewards[:n_envs]))
+        """The episodes that go on where none ``starts``; the environments may be more or fewer than before."""
+        timesteps = np.resize(self.timesteps, len(starts))
+        rewards = np.resize(self.rewards, len(starts))
+        return Running(np.where(starts, 0, timesteps), np.where(starts, 0.0, rewards))
 
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""

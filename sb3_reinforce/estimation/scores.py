@@ -28,8 +28,8 @@ CHUNK = 2**25
 # Steps that share a forward and a backward pass: what these leave behind should fit into the cache
 STEPS = 4096
 
-# δ (n, n_out), and x (n, n_in) or None for a parameter that is added to z
-Factors: TypeAlias = tuple[th.Tensor, th.Tensor | None]
+# δ (n, n_out) and x (n, n_in), which is 1 for a parameter that is added to z
+Factors: TypeAlias = tuple[th.Tensor, th.Tensor]
 
 
 def gradients_by_episode(
@@ -49,26 +49,21 @@ def gradients_by_episode(
     """
     parameters = scored_parameters(rollout)
     w = th.stack([select(weight, rollout.used) for weight in weights]).to(parameters[0])
-    obs = select(rollout.inputs, rollout.used)
-    actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
     _, rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)
     n = len(range(sum(parameter.numel() for parameter in parameters))[columns])
     result = w.new_zeros(len(w), int(rank.max()) + 1, n)
-    for episode, gradients in episode_sums(rollout.policy, parameters, obs, actions, w, rank, chunk):
+    for episode, gradients in episode_sums(rollout, parameters, w, rank, chunk):
         result[:, episode] += gradients[:, columns]
     return result
 
 
 def episode_sums(
-    policy: ActorCriticPolicy,
-    parameters: Parameters,
-    obs: PyTorchObs,
-    actions: th.Tensor,
-    w: th.Tensor,
-    rank: th.Tensor,
-    chunk: int,
+    rollout: Rollout, parameters: Parameters, w: th.Tensor, rank: th.Tensor, chunk: int
 ) -> Iterator[tuple[int, th.Tensor]]:
     """Episodes, each with ``Σ_t w_t ∇ log π`` over some of its steps, shape ``(k, n)``, for k weights of all steps."""
+    policy = rollout.policy
+    obs = select(rollout.inputs, rollout.used)
+    actions = as_policy_actions(select(rollout.actions, rollout.used), policy.action_space)
     layers = factored_layers(policy)
     if layers is None:
         for episode, steps in enumerate(steps_of(rank)):
@@ -82,8 +77,13 @@ def episode_sums(
     for steps, ranks in zip(th.split(order, n_at_once), th.split(rank, n_at_once), strict=True):
         factors = score_factors(policy, layers, features[steps], actions[steps])
         for episode, part in zip(th.unique(ranks).tolist(), steps_of(ranks), strict=True):
-            shares = [weighted_sum(w[:, steps[part]], factors[parameter], part) for parameter in parameters]
-            yield episode, th.cat(shares, dim=1)
+            weights = w[:, steps[part]]
+            # Σ_t w_t δ_t x_tᵀ
+            sums = [
+                ((weights[:, None] * delta[part].T) @ x[part]).flatten(1)
+                for delta, x in (factors[parameter] for parameter in parameters)
+            ]
+            yield episode, th.cat(sums, dim=1)
 
 
 def vector_jacobian_product(log_prob: th.Tensor, parameters: Parameters, w: th.Tensor) -> th.Tensor:
@@ -131,13 +131,16 @@ def score_factors(
     policy: ActorCriticPolicy, layers: list[nn.Module], x: th.Tensor, actions: th.Tensor
 ) -> dict[th.Tensor, Factors]:
     """The factors of the score of ``n`` steps with features x, for each parameter of a plain actor."""
+    ones = x.new_ones(len(x), 1)
     inputs, outputs = [], []
     with th.enable_grad():
+        # Gradients flow to the outputs of all layers, of frozen ones too
+        x.requires_grad_()
         for layer in layers:
             if isinstance(layer, nn.Linear):
                 inputs.append(x.detach())
-                x = F.linear(x, layer.weight.detach(), layer.bias.detach())
-                outputs.append(x if x.requires_grad else x.requires_grad_())
+                x = F.linear(x, layer.weight, layer.bias)
+                outputs.append(x)
             else:
                 x = layer(x)
         logits = divide(layers[-1], x)
@@ -151,21 +154,8 @@ def score_factors(
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     for layer, delta, each in zip(linear, deltas[: len(linear)], inputs, strict=True):
         factors[layer.weight] = (delta, each)
-        factors[layer.bias] = (delta, None)
+        factors[layer.bias] = (delta, ones)
     if log_std:
         # One log_std may serve several actions
-        factors[policy.log_std] = (deltas[-1].sum_to_size(len(actions), *policy.log_std.shape), None)
+        factors[policy.log_std] = (deltas[-1].sum_to_size(len(actions), *policy.log_std.shape), ones)
     return factors
-
-
-def weighted_sum(w: th.Tensor, factors: Factors, steps: th.Tensor) -> th.Tensor:
-    """``Σ_t w_t δ_t x_tᵀ`` or ``Σ_t w_t δ_t`` for k weights, shape ``(k, n_out * n_in)`` or ``(k, n_out)``."""
-    delta = factors[0][steps]
-    if factors[1] is None:
-        return w @ delta
-    x = factors[1][steps]
-    # The narrower factor takes the weights
-    if delta.shape[1] <= x.shape[1]:
-        return ((w[:, None] * delta.T).flatten(0, 1) @ x).view(len(w), -1)
-    products = delta.T @ (w.T[:, :, None] * x[:, None]).flatten(1)
-    return products.view(-1, len(w), x.shape[1]).transpose(0, 1).flatten(1)

@@ -13,6 +13,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
+from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
 from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
@@ -46,17 +47,16 @@ def complete_rollout(
     timesteps = timesteps_of(dones, running.timesteps)
     # m_t = 1 where G_t is known
     used = np.ones_like(dones) if next_values is not None else in_finished_episode(dones)
-    if quota is not None:
+    if quota is None:
+        check_used(used)
+        denominator = used.size
+    else:
         used = used & within_quota(dones, quota)
-    check_used(used, None if quota is not None else len(dones))
+        denominator = int(used.sum() if normalize_by == "steps" else quota.sum())
     returns_to_go = lambda_return(rewards, dones, 0.0 if next_values is None else next_values, gamma, gae_lambda)
     returns = returns_to_go if reward_to_go else total_return(returns_to_go, timesteps, gamma, running.rewards)
     # The total return has γ^t already
     exponents = timesteps * (discount_scores and reward_to_go)
-    if quota is None:
-        denominator = used.size
-    else:
-        denominator = int(used.sum() if normalize_by == "steps" else quota.sum())
     rollout = Rollout(
         observations=obs_as_tensor(buffer.observations, policy.device),
         actions=th.as_tensor(buffer.actions, device=policy.device),
@@ -133,14 +133,14 @@ def training_batch(rollout: Rollout, advantages: Floats, returns: Floats, normal
     )
 
 
-def check_used(used: Bools, n_steps: int | None) -> None:
-    """Refuse a rollout of ``n_steps`` without a known return, and warn if episodes that it cuts are left out."""
+def check_used(used: Bools) -> None:
+    """Refuse a fixed rollout without a known return, and warn if episodes that it cuts are left out."""
     if not used.any():
         raise ValueError(
-            f"No episode ended within n_steps={n_steps}, and without a critic the return of an unfinished episode is "
+            f"No episode ended within n_steps={len(used)}, and without a critic the return of an unfinished episode is "
             "not known: raise n_steps, set n_episodes instead, or use baseline='value'"
         )
-    if n_steps is not None and not used.all():
+    if not used.all():
         warnings.warn(
             "Episodes that n_steps cuts are left out, since without a critic their return is not known. Long episodes "
             "are cut more often than short ones, so the gradient is biased towards short episodes: n_episodes instead "
@@ -158,11 +158,6 @@ def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
             f"baseline must return a tensor of shape (n_steps, n_envs) = {tuple(rollout.returns.shape)}, got "
             f"{tuple(baseline.shape)}"
         )
-    values = baseline.detach().cpu().double().numpy()
-    wrong = np.argwhere(~np.isfinite(values) & rollout.used.numpy())
-    if len(wrong):
-        step, env = wrong[0]
-        raise ValueError(
-            f"baseline must return finite values, got {values[step, env]} at step {step} of environment {env}"
-        )
-    return np.where(rollout.used.numpy(), values, 0.0)
+    values: Floats = np.where(rollout.used.numpy(), baseline.detach().cpu().double().numpy(), 0.0)
+    check_finite("The baseline", values)
+    return values

@@ -47,10 +47,8 @@ class PolicyActor:
         return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
 
     @th.no_grad()
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray | None:
-        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``; None if ``act`` returns it."""
-        if self.route.forward:
-            return None
+    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``, where ``act`` does not return it."""
         policy = self.policy
         rows = as_policy_actions(th.as_tensor(actions, device=policy.device).flatten(0, 1), policy.action_space)
         obs = flatten(obs_as_tensor(obs, policy.device))
@@ -65,9 +63,11 @@ class PolicyActor:
 class NumpyActor:
     """Acts by NumPy, for a plain MLP on flat observations."""
 
-    def __init__(self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int, keep_outputs: bool):
+    def __init__(
+        self, policy: ActorCriticPolicy, layers: list[nn.Module], n_envs: int, with_log_prob: bool, *before: nn.Module
+    ):
         self.policy = policy
-        self.keep_outputs = keep_outputs
+        self.with_log_prob = with_log_prob
         self.shape = (n_envs, *(policy.action_space.shape or ()))
         self.forward = numpy_forward(layers, n_envs)
         self.sample = sampler_of(policy, n_envs)
@@ -78,14 +78,14 @@ class NumpyActor:
         self.mlp_extractor = policy.mlp_extractor
         self.extractor = [policy.pi_features_extractor, *policy.pi_features_extractor.children()]
         body = policy.mlp_extractor.policy_net
-        parts = [policy, self.mlp_extractor, body, *self.extractor, *layers]
+        parts = [policy, self.mlp_extractor, body, *self.extractor, *before, *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
         self.dicts = [vars(self.distribution), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
         outputs = self.forward(obs)
-        if self.keep_outputs:
+        if self.with_log_prob:
             self.outputs.append(outputs.copy())
         return self.sample(outputs).reshape(self.shape), None, None
 
@@ -120,10 +120,10 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
     return [tensor.data_ptr() for tensor in tensors]
 
 
-def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, keep_outputs: bool = True) -> Actor:
-    """The fastest actor that acts as the policy would; ``keep_outputs`` is for ``log_prob``."""
+def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_prob: bool = True) -> Actor:
+    """The fastest actor that acts as the policy would; log π is None without ``with_log_prob``."""
     if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
-        return NumpyActor(policy, route.actor, n_envs, keep_outputs)
+        return NumpyActor(policy, route.actor, n_envs, with_log_prob)
     return PolicyActor(policy, route)
 
 

@@ -67,9 +67,8 @@ class Extent:
         counted = np.flatnonzero(dones & (self.remaining > 0))
         self.remaining[counted] -= 1
         self.starts[counted] = n_steps
-        if self.n_steps == np.inf:
-            self.is_complete = not self.remaining.any()
-            self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
+        self.is_complete = not self.remaining.any()
+        self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
         return list(counted.tolist())
 
 
@@ -107,8 +106,9 @@ def collect(
         actions, values, log_probs = actor.act(model._last_obs)
         write_row(rollout_buffer.observations, n_steps, model._last_obs)
         write_row(rollout_buffer.actions, n_steps, actions)
-        if values is not None and log_probs is not None:
+        if values is not None:
             write_row(rollout_buffer.values, n_steps, values)
+        if log_probs is not None:
             write_row(rollout_buffer.log_probs, n_steps, log_probs)
 
         if model.use_sde:
@@ -136,7 +136,8 @@ def collect(
                     # Some VecEnvs write the next terminal observation into the same array
                     terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
         if is_attached and not actor.is_current(model.policy):
-            write_log_probs(rollout_buffer, actor, first_row)
+            if log_probs is None:
+                write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
             route = route_of(policy, route.with_critic)
             actor = actor_of(route, is_attached)
@@ -146,7 +147,7 @@ def collect(
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
     rollout_buffer.episode_starts[:] = starts[:-1]
-    if is_attached:
+    if is_attached and log_probs is None:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, route
 
@@ -162,12 +163,11 @@ def write_row(rows: Any, step: int, values: Any) -> None:
 
 
 def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None:
-    """Write log π of the rows from ``first_row`` on, unless the actor has computed them along with the actions."""
-    rows = slice(first_row, buffer.pos)
-    obs: Any = buffer.observations
-    log_probs = actor.log_prob(take(obs, rows), buffer.actions[rows]) if first_row < buffer.pos else None
-    if log_probs is not None:
-        buffer.log_probs[rows] = log_probs.reshape(-1, buffer.n_envs)
+    """Write log π of the rows from ``first_row`` on."""
+    if first_row < buffer.pos:
+        rows = slice(first_row, buffer.pos)
+        obs: Any = buffer.observations
+        buffer.log_probs[rows] = actor.log_prob(take(obs, rows), buffer.actions[rows]).reshape(-1, buffer.n_envs)
 
 
 def resize(buffer: RolloutBuffer, n_steps: int) -> None:

@@ -11,11 +11,9 @@ from torch import nn
 
 from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import (
-    HOOKS,
-    ONE_THREAD,
-    Floats,
     has_numpy_form,
     is_unchanged,
+    numpy_forward,
     plain_actor,
     takes_vectors,
 )
@@ -30,12 +28,11 @@ Starts: TypeAlias = Callable[[], Bools]
 class RecurrentPolicyActor(PolicyActor):
     """Acts by the policy's own methods, from a state of shape ``(n_envs, 2, n_layers, n_hidden)``."""
 
-    def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool):
+    def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool):
         super().__init__(policy, route_of(policy))
         self.starts = starts
-        self.keep_outputs = keep_outputs
+        self.with_log_prob = with_log_prob
         self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
-        self.log_probs: list[np.ndarray] = []
 
     @th.no_grad()
     def act(self, obs: Any) -> Acted:
@@ -46,13 +43,9 @@ class RecurrentPolicyActor(PolicyActor):
             obs_as_tensor(obs, policy.device), self.halves, episode_starts
         )
         actions = distribution.get_actions()
-        if self.keep_outputs:
-            self.log_probs.append(distribution.log_prob(actions).cpu().numpy())
-        return actions.cpu().numpy().reshape(-1, *self.shape), None, None
-
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
-        """log π of the steps, as they were drawn, shape ``(n_steps * n_envs,)``."""
-        return np.concatenate(self.log_probs)
+        # Not in one batch after the rollout, for which the memory would be computed again
+        log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
+        return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
 
     def state(self) -> th.Tensor:
         """The actor's state after its last step, shape ``(n_envs, 2, n_layers, n_hidden)``."""
@@ -67,15 +60,13 @@ class LstmActor(NumpyActor):
     """Acts by NumPy, for an LSTM of one layer between flat observations and a plain MLP."""
 
     def __init__(
-        self, policy: RecurrentPolicy, layers: list[nn.Module], state: th.Tensor, starts: Starts, keep_outputs: bool
+        self, policy: RecurrentPolicy, layers: list[nn.Module], state: th.Tensor, starts: Starts, with_log_prob: bool
     ):
-        super().__init__(policy, layers, len(state), keep_outputs)
+        super().__init__(policy, layers, len(state), with_log_prob, policy.lstm_actor)
         self.starts = starts
         self.lstm = policy.lstm_actor
         self.cell = LstmCell(self.lstm, state)
         self.lstm_addresses = [parameter.data_ptr() for parameter in self.lstm.parameters()]
-        self.dicts += [vars(self.lstm), *(vars(self.lstm)[name] for name in HOOKS)]
-        self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
         return super().act(self.cell.step(obs, self.starts()))
@@ -94,13 +85,10 @@ class LstmCell:
 
     def __init__(self, lstm: Any, state: th.Tensor):
         self.hidden, self.cell = (half.numpy().copy() for half in state[:, :, 0].unbind(1))
-        self.weights = [parameter.detach().T for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
-        is_small = len(state) * max(weight.numel() for weight in self.weights) <= ONE_THREAD
-        self.multiply = by_numpy if is_small else by_torch
-        self.biases = [parameter.detach().numpy() for parameter in (lstm.bias_ih_l0, lstm.bias_hh_l0)]
-        n_hidden = lstm.hidden_size
+        self.from_obs = numpy_forward([linear_of(lstm.weight_ih_l0, lstm.bias_ih_l0)], len(state))
+        self.from_hidden = numpy_forward([linear_of(lstm.weight_hh_l0, lstm.bias_hh_l0)], len(state))
         # σ(x) = ½ tanh(½ x) + ½ for three gates, and tanh itself for g
-        self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), n_hidden)
+        self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), lstm.hidden_size)
         self.shift = 1 - self.scale
 
     @np.errstate(all="ignore")
@@ -114,37 +102,32 @@ class LstmCell:
         if np.count_nonzero(starts):
             self.hidden[starts] = 0
             self.cell[starts] = 0
-        x = obs.reshape(len(starts), -1).astype(np.float32, copy=False)
-        gates = self.multiply(x, self.weights[0]) + self.multiply(self.hidden, self.weights[1])
-        gates += self.biases[0]
-        gates += self.biases[1]
+        gates = self.from_obs(obs) + self.from_hidden(self.hidden)
         i, f, g, o = np.split(np.tanh(gates * self.scale) * self.scale + self.shift, 4, axis=1)
         self.cell = f * self.cell + i * g
         self.hidden = o * np.tanh(self.cell)
         return self.hidden
 
 
-def by_numpy(x: Floats, weight: th.Tensor) -> Any:
-    """``x W``."""
-    return np.dot(x, weight.numpy())
-
-
-def by_torch(x: Floats, weight: th.Tensor) -> Any:
-    """``x W``, with as many threads as the user has set for PyTorch."""
-    return th.mm(th.from_numpy(x), weight).numpy()
+def linear_of(weight: nn.Parameter, bias: nn.Parameter) -> nn.Linear:
+    """A linear layer with given parameters."""
+    layer: nn.Linear = nn.utils.skip_init(nn.Linear, *reversed(weight.shape))  # type: ignore[no-untyped-call]
+    layer.weight = weight
+    layer.bias = bias
+    return layer
 
 
 RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor
 
 
 def make_recurrent_actor(
-    policy: RecurrentPolicy, state: th.Tensor, starts: Starts, keep_outputs: bool
+    policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool
 ) -> RecurrentActor:
     """The fastest actor that acts as the policy would."""
     layers = make_head(policy)
     if layers is not None:
-        return LstmActor(policy, layers, state, starts, keep_outputs)
-    return RecurrentPolicyActor(policy, state, starts, keep_outputs)
+        return LstmActor(policy, layers, state, starts, with_log_prob)
+    return RecurrentPolicyActor(policy, state, starts, with_log_prob)
 
 
 def make_head(policy: Any) -> list[nn.Module] | None:

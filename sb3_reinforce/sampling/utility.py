@@ -1,7 +1,6 @@
 """The utility of candidates by episodes, as an estimator of FiniteDifference asks for it."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
-from sb3_reinforce.sampling.normalization import ObservationStatistics, frozen
+from sb3_reinforce.sampling.normalization import ObservationStatistics
 
 
 class Stopped(Exception):
@@ -21,7 +20,11 @@ class Stopped(Exception):
 
 @dataclass
 class EpisodicUtility:
-    """U(θ) = E[Σ_t r_t] by episodes in a FiniteDifference's environments; it keeps all candidates and their values."""
+    """
+    U(θ) = E[Σ_t r_t] by the episodes of one update of a FiniteDifference, which begin with ``first_seed``.
+
+    It keeps all candidates and their values; ``observed`` is None unless a VecNormalize is frozen meanwhile.
+    """
 
     model: Any
     searched: Sequence[th.nn.Parameter]
@@ -82,12 +85,3 @@ class EpisodicUtility:
             self.observed.vec_normalize.training = False
         if not go_on:
             raise Stopped
-
-
-@contextmanager
-def episodic_utility(
-    model: Any, searched: Sequence[th.nn.Parameter], callback: BaseCallback, first_seed: int
-) -> Iterator[EpisodicUtility]:
-    """The utility of one update, during which VecNormalize is frozen; its episodes begin with ``first_seed``."""
-    with frozen(model.get_vec_normalize_env()) as observed:
-        yield EpisodicUtility(model, searched, callback, observed, first_seed)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
-from environments import Corridor, Random
+from environments import Corridor, Random, Reused
 from gymnasium import spaces
 from models import KINDS, all_kinds, make, moved_by_learning, plain
 from stable_baselines3 import A2C
@@ -29,7 +29,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
@@ -418,23 +418,6 @@ def test_a_callback_may_shape_the_rewards_in_place():
 
     model = make("steps").learn(8, callback=shape)
     assert (model.rollout_buffer.rewards == 5).all()
-
-
-class Reused(VecEnvWrapper):
-    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
-
-    def reset(self):
-        return self.venv.reset()
-
-    def step_wait(self):
-        obs, rewards, dones, infos = self.venv.step_wait()
-        self.dones = getattr(self, "dones", np.zeros(self.num_envs, dtype=np.uint8))
-        self.dones[:] = dones
-        self.last = getattr(self, "last", np.zeros_like(obs))
-        for i in np.flatnonzero(dones):
-            self.last[i] = infos[i]["terminal_observation"]
-            infos[i]["terminal_observation"] = self.last[i]
-        return obs, rewards, self.dones, infos
 
 
 @both_modes

@@ -243,14 +243,9 @@ def test_a_shared_extractor_descends_the_critics_error_too():
 @pytest.mark.parametrize("max_grad_norm", [None, 0.1])
 def test_a_pass_of_the_critic_descends_its_error(max_grad_norm):
     """One pass in one batch at rate 1 is −∇ mean (G − V)², clipped to the norm allowed; G and b are from before."""
-    env = make_vec_env(lambda: Logging(False), 2, seed=0)
-    kwargs = {"net_arch": [], "optimizer_class": th.optim.SGD}
-    model = REINFORCE(
-        "MlpPolicy", env, learning_rate=0.0, critic_learning_rate=1.0, n_steps=8, n_critic_updates=1, batch_size=16,
-        max_grad_norm=max_grad_norm, policy_kwargs=kwargs, seed=0, device="cpu",
-    )  # fmt: skip
-    weight, bias = (parameter.detach().clone() for parameter in model.policy.value_net.parameters())
-    model.learn(16)
+    arguments = dict(n_steps=8, n_critic_updates=1, batch_size=16, max_grad_norm=max_grad_norm)
+    model, before, _ = learn(1, 2, critic_learning_rate=1.0, **arguments)
+    weight, bias = (th.tensor(before[f"value_net.{name}"], dtype=th.float32) for name in ("weight", "bias"))
     buffer = model.rollout_buffer
     weight.requires_grad_()
     values = (th.as_tensor(buffer.observations).flatten(0, 1) @ weight.T + bias).flatten()

@@ -31,15 +31,10 @@ def test_to_repeat_the_observation(env_class, baseline):
     assert mean >= 90
 
 
-def train_on_cart_pole(seed):
+def stop_at_490(eval_env, eval_freq):
     """As ``examples/1_reinforce.py``: stop once 20 episodes score 490."""
     stop = StopTrainingOnRewardThreshold(reward_threshold=490, verbose=0)
-    evaluation = EvalCallback(
-        make_vec_env("CartPole-v1", 5, seed=1000 + seed), callback_on_new_best=stop, n_eval_episodes=20, verbose=0,
-        eval_freq=4000 // 8,
-    )  # fmt: skip
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 8, seed=seed), gae_lambda=0.95, seed=seed, device="cpu")
-    return model.learn(150_000, callback=evaluation)
+    return EvalCallback(eval_env, callback_on_new_best=stop, n_eval_episodes=20, eval_freq=eval_freq, verbose=0)
 
 
 def score(model, seed):
@@ -50,7 +45,8 @@ def score(model, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_cart_pole_is_solved(seed):
-    model = train_on_cart_pole(seed)
+    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 8, seed=seed), gae_lambda=0.95, seed=seed, device="cpu")
+    model.learn(150_000, callback=stop_at_490(make_vec_env("CartPole-v1", 5, seed=1000 + seed), 4000 // 8))
     assert model.num_timesteps <= 150_000 and score(model, seed) >= 475
 
 
@@ -62,6 +58,4 @@ def test_cart_pole_is_solved_on_a_native_vector_environment(seed):
         for n_envs in (256, 5)
     )
     model = REINFORCE("MlpPolicy", env, n_steps=8, gae_lambda=0.95, seed=seed, device="cpu", batch_size=512)
-    stop = StopTrainingOnRewardThreshold(reward_threshold=490, verbose=0)
-    evaluation = EvalCallback(eval_env, callback_on_new_best=stop, n_eval_episodes=20, eval_freq=40, verbose=0)
-    assert score(model.learn(1_000_000, callback=evaluation), seed) >= 475
+    assert score(model.learn(1_000_000, callback=stop_at_490(eval_env, 40)), seed) >= 475

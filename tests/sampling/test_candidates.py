@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from models import OwnPrediction, Scaled
+from policy_changes import CHANGES
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -89,31 +90,6 @@ def test_side_by_side_is_one_by_one(policy_class, obs_space, kwargs, expected, a
         pytest.skip("gSDE is for Box actions")
     th.manual_seed(0)
     check_side_by_side_is_one_by_one(policy_class(obs_space, actions, lambda _: 1e-3, **kwargs), expected)
-
-
-def shift(*inputs):
-    """A forward hook."""
-    return inputs[-1] + th.arange(inputs[-1].shape[-1])
-
-
-def replace(thing, name, change):
-    """Put a function that refers to the old method in its place."""
-    old = getattr(thing, name)
-    setattr(thing, name, lambda *args, **kwargs: old(change(*args[:1], *kwargs.values()), *args[1:]))
-
-
-# What a user may do to a policy to change how it acts
-CHANGES = {
-    "hook on flatten": lambda policy: policy.features_extractor.flatten.register_forward_hook(shift),
-    "hook on the extractor": lambda policy: policy.features_extractor.register_forward_hook(shift),
-    "hook on a layer": lambda policy: policy.mlp_extractor.policy_net[0].register_forward_hook(shift),
-    "hook before a layer": lambda policy: policy.action_net.register_forward_pre_hook(lambda layer, x: (2 * x[0],)),
-    "forward_actor": lambda policy: replace(policy.mlp_extractor, "forward_actor", lambda x: x * x),
-    "proba_distribution": lambda policy: replace(policy.action_dist, "proba_distribution", shift),
-    "extract_features": lambda policy: replace(policy, "extract_features", lambda x: -x),
-    "forward of a layer": lambda policy: replace(policy.action_net, "forward", lambda x: -x),
-    "temperature": lambda policy: set_temperature(policy, 0.1),
-}
 
 
 @pytest.mark.parametrize("change", CHANGES)

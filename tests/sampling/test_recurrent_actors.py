@@ -20,13 +20,16 @@ def recorded(actor, n_steps=200, n_envs=3):
     th.manual_seed(1)
     obs = rng.normal(size=(n_steps, n_envs, 5)).astype(np.float32)
     starts = rng.random((n_steps, n_envs)) < 0.1
-    actions, states = [], []
+    actions, states, log_probs = [], [], []
     for t in range(n_steps):
         actor.starts = lambda t=t: starts[t]
-        actions.append(actor.act(obs[t])[0])
+        action, _, log_prob = actor.act(obs[t])
+        actions.append(action)
+        log_probs.append(log_prob)
         states.append(actor.state())
-    stored = np.array(actions).reshape(n_steps, n_envs, -1)
-    return obs, starts, np.array(actions), th.stack(states), actor.log_prob(obs, stored)
+    if log_probs[0] is None:
+        log_probs = actor.log_prob(obs, np.array(actions).reshape(n_steps, n_envs, -1))
+    return obs, starts, np.array(actions), th.stack(states), np.ravel(log_probs)
 
 
 def corridor(space, n_envs=3):
