@@ -13,7 +13,7 @@ from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
-from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, largest_entropy, std_of
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
@@ -229,9 +229,7 @@ class PitfallCallback(Diagnosis):
         set_temperature(rollout.policy, present)
         return Update(
             kl=float((self.log_prob - log_prob).mean()),
-            entropy=-logged.get("train/entropy_loss", math.nan),
-            largest_entropy=largest_entropy(rollout.policy, self.obs),
-            std=std_of(rollout.policy, self.obs),
+            randomness=randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan)),
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,
