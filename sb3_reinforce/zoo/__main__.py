@@ -38,20 +38,16 @@ NOT_OFFERED = {
 }
 
 
-class StorePython(utils.StoreDict):
-    """The Zoo's ``KEY:VALUE`` arguments, whose values are Python, with errors that name the text."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any) -> None:
-        stored = {}
-        for text in values:
-            if ":" not in text:
-                parser.error(f"{text!r} must be KEY:VALUE")
-            try:
-                super().__call__(parser, namespace, [text])  # type: ignore[no-untyped-call]
-            except Exception as error:
-                parser.error(f"the value of {text!r} must be Python ({error!r}); write a text as KEY:\"'TEXT'\"")
-            stored.update(getattr(namespace, self.dest))
-        setattr(namespace, self.dest, stored)
+def key_and_value(text: str) -> tuple[str, Any]:
+    """A ``KEY:VALUE`` argument of the Zoo, which evaluates the value as Python with the names of its ``utils``."""
+    key, colon, value = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{text!r} must be KEY:VALUE")
+    try:
+        return key, eval(value, dict(vars(utils)))
+    except Exception as error:
+        message = f"the value of {text!r} must be Python ({error!r}); write a text as KEY:\"'TEXT'\""
+        raise argparse.ArgumentTypeError(message) from error
 
 
 def run_script(command: str) -> None:
@@ -107,7 +103,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
     for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
         known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
-        known.add_argument(*names, nargs="+", action=StorePython)
+        known.add_argument(*names, nargs="+", type=key_and_value, default=[])
     given, _ = known.parse_known_args(arguments)
     if command == "benchmark":
         check_benchmark(parser, given)
@@ -123,7 +119,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
     for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
         try:
             if env_kwargs:
-                gym.make(given.env, **env_kwargs).close()
+                gym.make(given.env, **dict(env_kwargs)).close()
         except TypeError as error:
             parser.error(f"{option}: {error}")
     if command != "train":
