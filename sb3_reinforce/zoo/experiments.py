@@ -75,7 +75,7 @@ class Experiment(exp_manager.ExperimentManager):
         except (AssertionError, TypeError, ValueError) as error:
             # Stable-Baselines3 asserts that a policy supports the spaces; errors about an argument name it at these
             # places; all other errors keep their traceback
-            named = re.findall(r"(?:^Invalid value for |^|, got |unexpected keyword argument ')(\w+)", str(error))
+            named = re.findall(r"(?:^|, got |unexpected keyword argument ')(\w+)", str(error))
             if isinstance(error, AssertionError) or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
@@ -102,17 +102,15 @@ class Experiment(exp_manager.ExperimentManager):
         pprint(saved)
         return found, saved
 
-    def _preprocess_hyperparams(self, hyperparams: Settings) -> tuple[Any, ...]:
-        """Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule."""
+    def _preprocess_schedules(self, hyperparams: Settings) -> Settings:  # type: ignore[override]
+        """Convert ``lin_NUMBER`` in every argument that may be a schedule; the algorithms take numbers themselves."""
         # The Zoo converts two of them, to a class without which the saved model could not be loaded. No public method
         # stands between the settings and the model
-        linear = {}
+        converted = dict(hyperparams)
         for key in scheduled_keys(self.algo) & hyperparams.keys():
             if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):
-                linear[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
-        others = {key: value for key, value in hyperparams.items() if key not in linear}
-        processed, *rest = super()._preprocess_hyperparams(others)
-        return processed | linear, *rest
+                converted[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
+        return converted
 
 
 def make_experiment(args: Any, algo: str, *others: Any, **kwargs: Any) -> exp_manager.ExperimentManager:

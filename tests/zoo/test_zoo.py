@@ -170,7 +170,7 @@ SETTINGS = [
     ("learning_rate: 1e-3", "write !!float 1e-3"),
     ("learning_rate: cos_1e-3", "lin_NUMBER"),
     ("ent_coef: lin_x", "lin_NUMBER"),
-    ("learning_rate: null", "Invalid value for learning_rate: None"),
+    ("learning_rate: null", "learning_rate must be a number or a schedule, got None"),
     ("n_step: 5", "did you mean n_steps"),
     ("seed: 5", "'seed' is not a setting"),
     ("gamma: 3", "gamma must be in [0, 1], got 3"),
