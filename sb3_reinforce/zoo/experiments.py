@@ -38,6 +38,8 @@ ZOO_KEYS = {
     "monitor_kwargs",
 }  # fmt: skip
 ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
+# Settings whose dict may be given as a text
+PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
 LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
 
 
@@ -126,18 +128,12 @@ def find_settings(experiment: Experiment) -> Settings:
         return dict(yaml.unsafe_load(experiment.model_config.read_text()))
     config, env_id = experiment.config, experiment.env_name.gym_id
     print(f"Loading hyperparameters from: {config}")
-    published = load_configuration(config)
-    if not isinstance(published, dict):
-        raise ConfigurationError(f"{config} must map environments to settings, got a {type(published).__name__}")
+    published = as_dict(f"The content of {config}", load_configuration(config))
     fallback = "atari" if experiment.is_atari(env_id) else "default"
-    if env_id not in published and fallback not in published:
-        raise ConfigurationError(f"{config} must have an entry {env_id} or {fallback}")
     key = env_id if env_id in published else fallback
-    if not isinstance(published[key], dict):
-        raise ConfigurationError(
-            f"The entry {key} of {config} must hold settings, such as policy: 'MlpPolicy', got {published[key]!r}"
-        )
-    found = dict(published[key])
+    if key not in published:
+        raise ConfigurationError(f"{config} must have an entry {env_id} or {fallback}")
+    found = dict(as_dict(f"The entry {key} of {config}", published[key]))
     return fit_default(found, experiment) if key == "default" else found
 
 
@@ -224,7 +220,7 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
 def as_dict(key: str, value: Any) -> Settings:
     """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
     result = {} if value is None else value
-    if isinstance(value, str) and key != "env_kwargs":
+    if isinstance(value, str) and key in PYTHON_KEYS:
         try:
             result = eval(value, dict(vars(exp_manager)))
         except Exception as error:

@@ -151,12 +151,13 @@ def test_without_the_zoo_its_models_load_and_its_bridge_says_what_to_install(tmp
 REINFORCE = ["train", "--algo", "reinforce"]
 ENTRY = "policy: MlpPolicy, n_timesteps: 100"
 CONFIGURATIONS = [
-    ("[1, 2]", "must map environments to settings, got a list"),
-    ("", "must map environments to settings, got a NoneType"),
+    ("[1, 2]", "wrong.yml must be a dict, got [1, 2]"),
+    ("text", "wrong.yml must be a dict, got 'text'"),
+    ("", "must have an entry CartPole-v1 or default"),
     ("CartPole-v1: {", "cannot be read: "),
     ("Acrobot-v1: {policy: MlpPolicy}", "must have an entry CartPole-v1 or default"),
-    ("CartPole-v1:", "The entry CartPole-v1 of"),
-    ("CartPole-v1: 5", "must hold settings, such as policy: 'MlpPolicy', got 5"),
+    ("CartPole-v1:", "must hold policy"),
+    ("CartPole-v1: 5", "wrong.yml must be a dict, got 5"),
     ("CartPole-v1: {policy: MlpPolicy}", "must hold n_timesteps"),
     ("CartPole-v1: {n_timesteps: 100}", "must hold policy"),
 ]
