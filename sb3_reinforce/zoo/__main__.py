@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import os
@@ -17,9 +18,10 @@ import gymnasium as gym
 from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
+from sb3_reinforce.common.arguments import unknown_name
 from sb3_reinforce.common.processes import Processes, is_leader, place
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.experiments import ConfigurationError, closest
+from sb3_reinforce.zoo.experiments import ConfigurationError
 
 FUNCTIONS = {
     "train": "rl_zoo3.train",
@@ -109,13 +111,11 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         check_benchmark(parser, given)
         return
     if given.algo not in utils.ALGOS:
-        hint = closest(given.algo, utils.ALGOS) or f", only {', '.join(utils.ALGOS)}"
-        parser.error(f"there is no --algo {given.algo}{hint}")
+        parser.error(str(unknown_name("--algo", "one of", utils.ALGOS, given.algo)))
     if given.env not in gym.registry:
-        parser.error(
-            f"--env {given.env} is not registered (an environment of another package needs --gym-packages PACKAGE)"
-            f"{closest(given.env, gym.registry)}"
-        )
+        near = difflib.get_close_matches(given.env, gym.registry, n=1)
+        hint = f": did you mean {near[0]}?" if near else ""
+        parser.error(f"--env {given.env} is not registered (one of another package needs --gym-packages PACKAGE){hint}")
     for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
         try:
             if env_kwargs:
@@ -166,7 +166,7 @@ def main() -> None:
     if command in NOT_OFFERED:
         parser.error(f"{command} is not offered: {NOT_OFFERED[command]}")
     if command not in COMMANDS:
-        parser.error(f"there is no command {command!r}, only {', '.join(COMMANDS)}")
+        parser.error(str(unknown_name("the command", "one of", COMMANDS, command)))
     arguments = sys.argv[2:]
     try:
         if command in CHECKED and not {"-h", "--help"} & {*arguments}:

@@ -1,12 +1,10 @@
 """Experiments of the RL Zoo with the algorithms of this package: their settings are found, checked and converted."""
 
-import difflib
 import importlib
 import inspect
 import re
 import runpy
 from collections import OrderedDict
-from collections.abc import Iterable
 from pathlib import Path
 from pprint import pprint
 from typing import Any, get_args
@@ -20,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_reinforce.common.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_number, unknown_name
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.reinforce import REINFORCE
@@ -185,18 +183,12 @@ def scheduled_keys(algorithm: str) -> set[str]:
     return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
 
 
-def closest(name: str, names: Iterable[str]) -> str:
-    """``: did you mean X?`` with the closest of the names, or nothing where none is close."""
-    return "".join(f": did you mean {near}?" for near in difflib.get_close_matches(name, names, n=1))
-
-
 def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     """Raise an error for settings that the Zoo would fail on; the algorithm checks its own arguments."""
     allowed = allowed_keys(algorithm)
     for key in hyperparams:
         if key not in allowed:
-            hint = closest(str(key), allowed) or f", only {', '.join(sorted(allowed))}"
-            raise ConfigurationError(f"{key!r} is not a setting of {algorithm}{hint}")
+            raise ConfigurationError(str(unknown_name(f"A setting of {algorithm}", "one of", sorted(allowed), key)))
     for key in ("policy", "n_timesteps"):
         if key not in hyperparams:
             raise ConfigurationError(f"The settings of {algorithm} must hold {key}, which the Zoo reads even with -n")
