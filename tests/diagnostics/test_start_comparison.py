@@ -46,11 +46,6 @@ def test_starts_are_the_same_whatever_the_number_of_environments(n_envs):
     assert report.share.value > 0.999
 
 
-def test_a_progress_bar_counts_the_episodes(capsys):
-    compare_starts(make_model(), n_starts=6, progress_bar=True)
-    assert "| 48/48 [" in capsys.readouterr().err
-
-
 def test_an_environment_that_ignores_seeds_is_refused():
     with pytest.raises(ValueError, match="cannot share their start"):
         compare_starts(make_model(ignores_seed=True))
