@@ -23,16 +23,10 @@ from sb3_reinforce.common.processes import Processes, is_leader, place
 from sb3_reinforce.zoo import ALGORITHMS
 from sb3_reinforce.zoo.experiments import ConfigurationError
 
-FUNCTIONS = {
-    "train": "rl_zoo3.train",
-    "enjoy": "rl_zoo3.enjoy",
-    "plot_train": "rl_zoo3.plots.plot_train",
-    "all_plots": "rl_zoo3.plots.all_plots",
-    "plot_from_file": "rl_zoo3.plots.plot_from_file",
-}
-SCRIPTS = {"record_video": "rl_zoo3.record_video", "benchmark": "rl_zoo3.benchmark"}
-COMMANDS = (*FUNCTIONS, *SCRIPTS)
-CHECKED = ("train", "enjoy", "record_video", "benchmark")
+PLOTS = ("plot_train", "all_plots", "plot_from_file")
+# Modules of the Zoo without a function
+SCRIPTS = ("record_video", "benchmark")
+COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 NOT_OFFERED = {
     "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
     "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
@@ -60,7 +54,7 @@ def run_script(command: str) -> None:
         # A file enjoy.py would have to lie in the user's folder, and `python` may be another interpreter
         subprocess.call = lambda arguments: call([*enjoy, *arguments[2:]])  # type: ignore[assignment,misc]
     try:
-        runpy.run_module(SCRIPTS[command], run_name="__main__")
+        runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
     finally:
         subprocess.call = call
 
@@ -169,17 +163,18 @@ def main() -> None:
         parser.error(str(unknown_name("the command", "one of", COMMANDS, command)))
     arguments = sys.argv[2:]
     try:
-        if command in CHECKED and not {"-h", "--help"} & {*arguments}:
+        if command not in PLOTS and not {"-h", "--help"} & {*arguments}:
             arguments = import_packages(command, arguments)
             check(parser, command, arguments)
         sys.argv = [f"{parser.prog} {command}", *arguments]
         if command == "train":
             with one_of_several(arguments) as sys.argv[1:]:
-                importlib.import_module(FUNCTIONS[command]).train()
-        elif command in FUNCTIONS:
-            getattr(importlib.import_module(FUNCTIONS[command]), command)()
-        else:
+                importlib.import_module("rl_zoo3.train").train()
+        elif command in SCRIPTS:
             run_script(command)
+        else:
+            module = f"rl_zoo3.plots.{command}" if command in PLOTS else f"rl_zoo3.{command}"
+            getattr(importlib.import_module(module), command)()
     except ModuleNotFoundError as error:
         parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
