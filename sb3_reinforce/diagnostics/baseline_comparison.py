@@ -110,12 +110,10 @@ def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -
                 "'value' out, or train a model with baseline='value'"
             )
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
-        if name in ("optimal", "floor") and function is not BASELINES.get(name):
-            raise ValueError(
-                f"baselines has a function named {name!r}, which is the name of a row: give it another name"
-            )
-        if functions.setdefault(name, function) is not function:
-            raise ValueError(f"baselines must have names that differ, and two of its functions are named {name!r}")
+        rows = {"optimal": BASELINES["optimal"], "floor": None, **functions}
+        if rows.get(name, function) is not function:
+            raise ValueError(f"baselines must have names that differ, and {name!r} is the name of another row")
+        functions[name] = function
     return functions
 
 

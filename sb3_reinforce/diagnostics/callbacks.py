@@ -13,7 +13,7 @@ from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
-from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, largest_entropy, std_of
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
@@ -21,16 +21,14 @@ from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import scored_parameters
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature, temperature_of
-from sb3_reinforce.reinforce import REINFORCE
 
 
 class Diagnosis(BaseCallback):
     """Keeps what it knows of a model from one ``learn()`` to the next, but not for another model."""
 
-    def __init__(self, verbose: int = 0):
-        super().__init__(verbose)
-        self.last_model: Any = None
-        self.forget()
+    # A REINFORCE, or for some a FiniteDifference
+    model: Any
+    last_model: Any = None
 
     def _init_callback(self) -> None:
         if self.model is not self.last_model:
@@ -91,12 +89,12 @@ class GradientQualityCallback(Diagnosis):
         super()._init_callback()
         if not isinstance(self.model, FiniteDifference):
             check_model(self.model, independent=True)
-            self.functions = functions_of(cast(REINFORCE, self.model), self.baselines)
+            self.functions = functions_of(self.model, self.baselines)
 
     def forget(self) -> None:
         """Start with a model of which nothing is known."""
         self.n_rollouts = 0
-        self.thetas: list[th.Tensor] = []
+        self.thetas: deque[th.Tensor] = deque(maxlen=3)
 
     def _on_rollout_end(self) -> None:
         self.n_rollouts += 1
@@ -104,26 +102,23 @@ class GradientQualityCallback(Diagnosis):
         if n_left > 2:
             # A cosine needs the parameters before the last three updates
             return
-        figures: dict[str, float] = {}
-        if isinstance(self.model, FiniteDifference):
-            theta = self.model.theta
-        else:
-            rollout = cast(Rollout, cast(REINFORCE, self.model).rollout)
-            try:
-                theta = to_vector(scored_parameters(rollout))
-            except ValueError:
-                # The actor is frozen
-                return
-            figures = {} if n_left else self.measure(rollout)
+        is_search = isinstance(self.model, FiniteDifference)
+        try:
+            theta = self.model.theta if is_search else to_vector(scored_parameters(self.model.rollout))
+        except ValueError:
+            # The actor is frozen
+            return
         if self.thetas and self.thetas[-1].shape != theta.shape:
-            self.thetas = []
-        self.thetas = [*self.thetas[-2:], theta]
+            self.thetas.clear()
+        self.thetas.append(theta)
+        if n_left > 0:
+            return
+        figures = {} if is_search else self.measure(self.model.rollout)
         if len(self.thetas) == 3:
-            before, after = th.stack(self.thetas).diff(dim=0)
+            before, after = th.stack(list(self.thetas)).diff(dim=0)
             figures["cosine"] = float(th.cosine_similarity(before, after, dim=0))
-        if n_left == 0:
-            for key, figure in figures.items():
-                self.logger.record(f"gradient/{key}", figure)
+        for key, figure in figures.items():
+            self.logger.record(f"gradient/{key}", figure)
 
     def measure(self, rollout: Rollout) -> dict[str, float]:
         """The figures of one rollout, before training on it."""
@@ -131,7 +126,7 @@ class GradientQualityCallback(Diagnosis):
         # Episodes that share their start are not independent
         if n_episodes < 2 or rollout.episodes_per_start > 1:
             return {}
-        own_weights = training_weights(cast(REINFORCE, self.model))
+        own_weights = training_weights(self.model)
         rollout = evenly_spread(rollout, self.max_episodes)
         weights = [own_weights, *(weights_by(function, rollout) for function in self.functions.values())]
         grams = sum(th.stack([gram(g) for g in block]) for block in gradient_blocks(rollout, *weights))
@@ -179,19 +174,19 @@ class PitfallCallback(Diagnosis):
         self.total_timesteps: int = self.locals["total_timesteps"]
 
     def _on_rollout_end(self) -> None:
-        model = cast(REINFORCE, self.model)
-        rollout = self.rollout = cast(Rollout, model.rollout)
+        rollout: Rollout = self.model.rollout
+        self.rollout = rollout
         policy = rollout.policy
         is_first = rollout.used & (rollout.used.flatten().cumsum(0).view_as(rollout.used) <= self.N_STEPS)
         self.obs = select(rollout.inputs, is_first)
-        self.actions = as_policy_actions(select(rollout.actions, is_first), model.action_space)
+        self.actions = as_policy_actions(select(rollout.actions, is_first), policy.action_space)
         self.temperature = temperature_of(policy)
         log_prob, _ = log_prob_and_entropy(policy, self.obs, self.actions)
         self.log_prob = log_prob.detach()
         self.gradient = th.zeros(0)
         if log_prob.requires_grad:
             parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
-            weights = select(training_weights(model), is_first).to(log_prob)
+            weights = select(training_weights(self.model), is_first).to(log_prob)
             gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
 
@@ -209,7 +204,7 @@ class PitfallCallback(Diagnosis):
         self.n_updates += 1
         self.rollout = None
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.total_timesteps)
-        history = History(cast(REINFORCE, self.model), list(self.updates), self.n_updates, progress_remaining)
+        history = History(self.model, list(self.updates), self.n_updates, progress_remaining)
         for name, pitfall in PITFALLS.items():
             is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
             sentence = None if name in self.found or is_explained else pitfall(history)
@@ -229,9 +224,7 @@ class PitfallCallback(Diagnosis):
         set_temperature(rollout.policy, present)
         return Update(
             kl=float((self.log_prob - log_prob).mean()),
-            entropy=-logged.get("train/entropy_loss", math.nan),
-            largest_entropy=largest_entropy(rollout.policy, self.obs),
-            std=std_of(rollout.policy, self.obs),
+            randomness=randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan)),
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,

@@ -1,6 +1,5 @@
 """The families of gradient estimators at one θ: which one detects the gradient of a task in the fewest steps."""
 
-import copy
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -145,7 +144,12 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``, shape
     ``(n_episodes, n)``, float64; and the environment steps of all environments.
     """
-    collector = undiscounted(model).sampling_copy(n_episodes, "leave_one_out")
+    collector = as_reinforce(model).sampling_copy(n_episodes, "none")
+    collector.gamma = 1.0
+    collector.gae_lambda = 1.0
+    collector.reward_to_go = True
+    collector.discount_scores = False
+    collector.max_episode_steps = model.max_episode_steps
     with undisturbed(model):
         env_of(model).seed(int(th.randint(2**31, ())))
         rollout = collect_episodes(collector)
@@ -156,21 +160,10 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     return gradients[:, mask], rollout.dones.numel()
 
 
-def undiscounted(model: REINFORCE | FiniteDifference) -> REINFORCE:
-    """A REINFORCE with a model's policy and environments, which weighs scores by reward-to-go at γ = 1."""
+def as_reinforce(model: REINFORCE | FiniteDifference) -> REINFORCE:
+    """A REINFORCE with a model's policy and environments."""
     if isinstance(model, REINFORCE):
-        copied = copy.copy(model)
-    else:
-        copied = REINFORCE(
-            type(model.policy),
-            env_of(model),
-            policy_kwargs=model.policy_kwargs,
-            max_episode_steps=model.max_episode_steps,
-            device=model.device,
-        )
-        copied.policy = model.policy
-    copied.gamma = 1.0
-    copied.gae_lambda = 1.0
-    copied.reward_to_go = True
-    copied.discount_scores = False
-    return copied
+        return model
+    reinforce = REINFORCE(type(model.policy), env_of(model), policy_kwargs=model.policy_kwargs, device=model.device)
+    reinforce.policy = model.policy
+    return reinforce

@@ -121,16 +121,17 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     scored_parameters(rollout)
     obs = select(rollout.inputs, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
+    some_obs, some_actions = spread(policy, obs, actions)
     if isinstance(policy, RecurrentPolicy):
         # Its ``forward`` has no sequences: log π is compared as it was when the episodes were played
         played = select(th.as_tensor(collector.rollout_buffer.log_probs), rollout.used)
         difference = largest_difference(log_prob_and_entropy(policy, obs, actions)[0].detach().cpu(), played)
     else:
-        difference = log_prob_error(policy, spread(obs, actions)[0])
+        difference = log_prob_error(policy, some_obs)
     return {
         "log_prob": difference,
-        "scores": score_error(policy, *spread(obs, actions)),
-        "sign": sign_error(policy, obs),
+        "scores": score_error(policy, some_obs, some_actions),
+        "sign": sign_error(policy, obs, len(actions)),
         "returns": return_error(collector, rollout),
         "weights": weight_error(collector, rollout),
         "surrogate": surrogate_error(collector, rollout),

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.common.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
 from sb3_reinforce.diagnostics.sampling import env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
 from sb3_reinforce.policies.parameters import actor_parameters, read
@@ -124,27 +124,24 @@ def landscape(
     utility = CandidateUtility(model, n_episodes, seed)
     n = len(utility.theta)
     gradients = {} if gradients is None else gradients
-    if not isinstance(gradients, Mapping):
-        raise TypeError(f"gradients must be a dictionary of tensors by name, got {type(gradients).__name__}")
-    known = {}
-    for name, given in gradients.items():
-        shape = (len(given), n) if isinstance(given, th.Tensor) and given.dim() == 2 else (n,)
-        known[name] = check_directions(f"gradients[{name!r}]", given, shape)
+    check_kind("gradients", gradients, (Mapping,), "a dictionary of tensors by name")
     if directions is None:
         drawn = th.randn(2, n, dtype=th.float64, generator=th.Generator().manual_seed(seed))
         plane = th.stack([filter_normalized(direction, utility.parameters) for direction in drawn])
     else:
         directions = check_directions("directions", directions, (2, n))
         plane = directions / directions.norm(dim=1, keepdim=True) * utility.theta.norm()
+    steps = {}
+    for name, given in gradients.items():
+        shape = (len(given), n) if isinstance(given, th.Tensor) and given.dim() == 2 else (n,)
+        gradient = check_directions(f"gradients[{name!r}]", given, shape)
+        projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*shape[:-1], 2)
+        steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
     bar = episode_bar(progress_bar, n_episodes * len(grid))
     with seeded(cast(ActorCriticPolicy, model.policy), seed), bar as utility.bar:
         utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
-    steps = {}
-    for name, gradient in known.items():
-        projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*gradient.shape[:-1], 2)
-        steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
     return Landscape(scales.numpy(), utilities.numpy(), steps, n_episodes)
 
 

@@ -25,9 +25,7 @@ class Update:
     """What is known of one update; NaN for what is not known."""
 
     kl: float  # mean of log π_old − log π_new over steps of the rollout, at its temperature
-    entropy: float  # mean entropy of the policy
-    largest_entropy: float  # of a policy that prefers no action
-    std: float  # mean standard deviation of the actions of a Gaussian policy
+    randomness: float  # share of the randomness that the policy could have, from 0 to 1
     grad_norm: float  # before clipping
     explained_variance: float  # of the critic
     gradient: th.Tensor  # some components, shape (c,); none if the actor is frozen
@@ -58,9 +56,10 @@ def rate_too_large(history: History) -> str | None:
     within ten, which a falling temperature may explain.
     """
     updates = history.updates[-10:]
-    space = history.model.action_space
     steps = [update.kl for update in updates]
-    if history.progress_remaining > 0.5 and randomness(space, updates[0]) < 0.05:
+    before = updates[0].randomness
+    after = updates[-1].randomness
+    if history.progress_remaining > 0.5 and before < 0.05:
         # Without randomness any rate is too large: see deterministic_too_early
         return None
     remedy = f"Lower the learning rate, now {history.model.lr_schedule(history.progress_remaining):.2g}"
@@ -69,7 +68,6 @@ def rate_too_large(history: History) -> str | None:
             f"The policy leaps: its KL divergence from one update to the next is {steps[-1]:.2g} (median of the last "
             f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let learning_rate decay"
         )
-    before, after = randomness(space, updates[0]), randomness(space, updates[-1])
     if before - after > 0.5 and updates[-1].temperature > 0.9 * updates[0].temperature:
         return (
             f"The entropy collapses: within {len(steps)} updates the policy went from {before:.0%} to {after:.0%} of "
@@ -153,12 +151,11 @@ def useless_critic(history: History) -> str | None:
 
 def deterministic_too_early(history: History) -> str | None:
     """Less than 5 % of the randomness left, before half of the training is over."""
-    space = history.model.action_space
     left = history.progress_remaining
-    share = randomness(space, history.updates[-1])
+    share = history.updates[-1].randomness
     if left > 0.5 and share < 0.05:
         remedy = f"raise temperature (now {history.updates[-1].temperature:.2g})"
-        if isinstance(space, spaces.Box):
+        if isinstance(history.model.action_space, spaces.Box):
             remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
         ent_coef: Any = history.model.ent_coef
         present = ent_coef(left) if callable(ent_coef) else ent_coef
@@ -170,28 +167,21 @@ def deterministic_too_early(history: History) -> str | None:
     return None
 
 
-def randomness(space: spaces.Space[Any], update: Update) -> float:
+def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
     """Entropy / largest entropy, or for a Box min(1, standard deviation / half the mean width); NaN if not known."""
-    if isinstance(space, spaces.Box):
-        return min(1.0, update.std / float((space.high - space.low).mean() / 2))
-    return update.entropy / update.largest_entropy if update.largest_entropy > 0 else math.nan
-
-
-def std_of(policy: ActorCriticPolicy, obs: Any) -> float:
-    """The mean standard deviation of a Gaussian policy's actions, which with gSDE ``train/std`` is not; else NaN."""
-    if not isinstance(policy.action_space, spaces.Box):
-        return math.nan
-    distribution = action_distribution(policy, obs).distribution
-    return float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
-
-
-def largest_entropy(policy: ActorCriticPolicy, obs: Any) -> float:
-    """The mean entropy if the policy preferred none of the actions that a mask allows; NaN where it is not known."""
+    space = policy.action_space
     distribution: Any = action_distribution(policy, obs).distribution
+    if isinstance(space, spaces.Box):
+        # Not train/std, which with gSDE is a standard deviation of weights
+        std = float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
+        return min(1.0, std / float((space.high - space.low).mean() / 2))
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
-        return float(sum(part.logits.isfinite().sum(-1).log().mean() for part in parts))
-    return math.log(2) * math.prod(policy.action_space.shape or ())
+        # Of a policy that prefers none of the actions that a mask allows
+        largest = float(sum(part.logits.isfinite().sum(-1).log().mean() for part in parts))
+    else:
+        largest = math.log(2) * math.prod(space.shape or ())
+    return entropy / largest if largest > 0 else math.nan
 
 
 def cut_episodes(history: History) -> str | None:

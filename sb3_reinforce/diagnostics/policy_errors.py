@@ -1,11 +1,12 @@
 """Errors of a policy that ``check_gradient`` measures: how far the two sides of each identity of log π are apart."""
 
+import math
 from collections.abc import Callable
-from typing import Any, cast
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -38,20 +39,14 @@ def largest_difference(log_prob: th.Tensor, other: th.Tensor) -> float:
     return float(((log_prob - other).abs() / other.abs().clamp(min=1)).max())
 
 
-def parts_of(obs: Any) -> list[th.Tensor]:
-    """The tensors of a batch of observations."""
-    return [each for part in obs.values() for each in parts_of(part)] if isinstance(obs, dict) else [obs]
+def n_at_once(policy: ActorCriticPolicy) -> int:
+    """The number of observations in a forward pass."""
+    return max(1, N_ELEMENTS // get_flattened_obs_dim(policy.observation_space))
 
 
-def size_of(obs: PyTorchObs) -> int:
-    """The number of elements of one observation."""
-    return sum(part[0].numel() for part in parts_of(obs))
-
-
-def spread(obs: PyTorchObs, actions: th.Tensor) -> tuple[PyTorchObs, th.Tensor]:
-    """Steps spread evenly over observations and actions, as many as ``N_ELEMENTS`` allow."""
-    allowed = max(1, N_ELEMENTS // size_of(obs))
-    steps = th.arange(0, len(actions), -(-len(actions) // allowed))
+def spread(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[PyTorchObs, th.Tensor]:
+    """Steps spread evenly over observations and actions, as many as a forward pass takes."""
+    steps = th.arange(0, len(actions), math.ceil(len(actions) / n_at_once(policy)))
     return take(obs, steps), actions[steps]
 
 
@@ -98,33 +93,34 @@ def values_at(thetas: th.Tensor, parameters: Parameters, function: Callable[[], 
     return th.stack(values)
 
 
-def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_actions: int = 8) -> float:
+def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int, n_actions: int = 8) -> float:
     """
     The fraction of sampled actions that are less likely after a step along their own score, ``θ + h ∇ log π(a|s)``.
 
-    It is measured from what the policy samples, not from log π (see ``closeness``). NaN if all samples are equal.
+    The actions are sampled at a few of the ``n_obs`` observations. It is measured from what the policy samples, not
+    from log π (see ``closeness``). NaN if all samples are equal.
     """
-    n_obs = len(parts_of(obs)[0])
-    n_draws = max(256, min(1024, N_ELEMENTS // size_of(obs)))
+    n_draws = max(256, min(1024, n_at_once(policy)))
     wrong = []
     for index in th.randperm(n_obs)[:n_actions]:
-        repeated = take(obs, index.repeat(n_draws))
-        draws = draw(policy, repeated)
+        one = take(obs, index[None])
+        draws = draw(policy, one, n_draws)
         # The effect of a step is clearest for the action that is farthest from the rest
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
-        before, after = closeness_after_step(policy, repeated, action)
+        before, after = closeness_after_step(policy, one, action, n_draws)
         if before < closeness(policy, action[None].expand_as(draws), action):
             wrong.append(bool(after <= before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
 
 
 @th.no_grad()
-def draw(policy: ActorCriticPolicy, obs: PyTorchObs) -> th.Tensor:
-    """Independent actions for a batch of observations; with gSDE each has its own noise matrix."""
+def draw(policy: ActorCriticPolicy, one: PyTorchObs, n: int) -> th.Tensor:
+    """Independent actions ``(n, ...)`` for one observation; with gSDE each has its own noise matrix."""
     if policy.use_sde:
-        policy.reset_noise(len(parts_of(obs)[0]))
+        policy.reset_noise(n)
+    obs = take(one, th.zeros(n, dtype=th.long))
     if isinstance(policy, RecurrentPolicy):
-        return as_evaluated(policy, policy.sequence_distribution(without_memory(cast(Any, obs))).get_actions())
+        return as_evaluated(policy, policy.sequence_distribution(without_memory(obs)).get_actions())
     return as_evaluated(policy, policy(obs)[0])
 
 
@@ -136,11 +132,10 @@ def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) ->
     return (draws == action).double().mean()
 
 
-def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
-    """``closeness`` before and after a step along the score of an action, (2,), with the same random numbers."""
-    first = take(obs, slice(1))
-    parameters = score_parameters(policy, first, action[None])
-    log_prob, _ = log_prob_and_entropy(policy, first, action[None])
+def closeness_after_step(policy: ActorCriticPolicy, one: PyTorchObs, action: th.Tensor, n: int) -> th.Tensor:
+    """``closeness`` before and after a step along the score of an action, (2,), with the same n random draws."""
+    parameters = score_parameters(policy, one, action[None])
+    log_prob, _ = log_prob_and_entropy(policy, one, action[None])
     gradient = to_vector(th.autograd.grad(log_prob.sum(), parameters))
     theta = to_vector(parameters)
     # To first order, log π(a|s) rises by 0.3
@@ -149,6 +144,6 @@ def closeness_after_step(policy: ActorCriticPolicy, obs: PyTorchObs, action: th.
 
     def measured() -> th.Tensor:
         with seeded(policy, seed):
-            return closeness(policy, draw(policy, obs), action)
+            return closeness(policy, draw(policy, one, n), action)
 
     return values_at(th.stack([theta, theta + step]), parameters, measured)

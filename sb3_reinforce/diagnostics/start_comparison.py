@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch as th
-from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
-from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, episode_bar, seeded
+from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
 from sb3_reinforce.envs.starts import check_groups
@@ -90,7 +90,7 @@ def compare_starts(
 
 def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -> list[Rollout]:
     """Rollouts of one episode per environment, which play ``N_PER_START`` episodes of each start in turn."""
-    env = check_model(model)
+    env = env_of(model)
     collector = model.sampling_copy(env.num_envs, "none")
     collector.gae_lambda = 1.0
     seeds = th.randint(2**31, (n_starts,)).numpy().repeat(N_PER_START)
@@ -110,9 +110,8 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
 
 def side_by_side(parts: list[th.Tensor]) -> th.Tensor:
     """Rows ``(n_steps, n_envs)`` of all rollouts, with zeros behind their end, by start: ``(n_steps, n_starts, k)``."""
-    n_steps = max(map(len, parts))
-    rows = th.cat([pad(part, (0, 0, 0, n_steps - len(part))) for part in parts], dim=1)
-    return rows.reshape(n_steps, -1, N_PER_START)
+    padded = pad_sequence(parts)
+    return padded.reshape(len(padded), -1, N_PER_START)
 
 
 def leave_one_out(returns: th.Tensor, used: th.Tensor, dim: int) -> th.Tensor:
@@ -133,15 +132,13 @@ def gram_matrices(rollouts: list[Rollout], returns: th.Tensor, used: th.Tensor) 
     for m in SIZES:
         groups = (*returns.shape[:2], -1, m)
         baselines[m] = leave_one_out(returns.reshape(groups), used.reshape(groups), dim=3).reshape(returns.shape)
-    residuals = [(returns - b) * used for b in baselines.values()]
+    residuals = (returns - th.stack(list(baselines.values()))) * used
     # Equal returns differ from their mean by rounding
-    zero = ROUNDING * returns.abs().max()
-    weights = [th.where(each.abs() > zero, each, 0.0).flatten(1) for each in residuals]
-    n_envs = rollouts[0].dones.shape[1]
+    weights = th.where(residuals.abs() > ROUNDING * returns.abs().max(), residuals, 0.0).flatten(2)
     blocks = []
-    for i, rollout in enumerate(rollouts):
-        own = [rollout.discounts * w[: len(rollout.dones), i * n_envs : (i + 1) * n_envs] for w in weights]
-        blocks.append(gradient_blocks(rollout, *own, floats=CHUNK // len(rollouts)))
+    for rollout, own in zip(rollouts, weights.chunk(len(rollouts), dim=2), strict=True):
+        w = rollout.discounts * own[:, : len(rollout.dones)]
+        blocks.append(gradient_blocks(rollout, *w, floats=CHUNK // len(rollouts)))
     n_starts = returns.shape[1]
     grams = {m: th.zeros(n_starts, n_starts, dtype=th.float64) for m in baselines}
     for block in zip(*blocks, strict=True):

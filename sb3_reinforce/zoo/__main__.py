@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import os
@@ -17,20 +18,15 @@ import gymnasium as gym
 from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
+from sb3_reinforce.common.arguments import unknown_name
 from sb3_reinforce.common.processes import Processes, is_leader, place
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.experiments import ConfigurationError, closest
+from sb3_reinforce.zoo.experiments import ConfigurationError
 
-FUNCTIONS = {
-    "train": "rl_zoo3.train",
-    "enjoy": "rl_zoo3.enjoy",
-    "plot_train": "rl_zoo3.plots.plot_train",
-    "all_plots": "rl_zoo3.plots.all_plots",
-    "plot_from_file": "rl_zoo3.plots.plot_from_file",
-}
-SCRIPTS = {"record_video": "rl_zoo3.record_video", "benchmark": "rl_zoo3.benchmark"}
-COMMANDS = (*FUNCTIONS, *SCRIPTS)
-CHECKED = ("train", "enjoy", "record_video", "benchmark")
+PLOTS = ("plot_train", "all_plots", "plot_from_file")
+# Modules of the Zoo without a function
+SCRIPTS = ("record_video", "benchmark")
+COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 NOT_OFFERED = {
     "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
     "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
@@ -38,20 +34,16 @@ NOT_OFFERED = {
 }
 
 
-class StorePython(utils.StoreDict):
-    """The Zoo's ``KEY:VALUE`` arguments, whose values are Python, with errors that name the text."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any) -> None:
-        stored = {}
-        for text in values:
-            if ":" not in text:
-                parser.error(f"{text!r} must be KEY:VALUE")
-            try:
-                super().__call__(parser, namespace, [text])  # type: ignore[no-untyped-call]
-            except Exception as error:
-                parser.error(f"the value of {text!r} must be Python ({error!r}); write a text as KEY:\"'TEXT'\"")
-            stored.update(getattr(namespace, self.dest))
-        setattr(namespace, self.dest, stored)
+def key_and_value(text: str) -> tuple[str, Any]:
+    """A ``KEY:VALUE`` argument of the Zoo, which evaluates the value as Python with the names of its ``utils``."""
+    key, colon, value = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{text!r} must be KEY:VALUE")
+    try:
+        return key, eval(value, dict(vars(utils)))
+    except Exception as error:
+        message = f"the value of {text!r} must be Python ({error!r}); write a text as KEY:\"'TEXT'\""
+        raise argparse.ArgumentTypeError(message) from error
 
 
 def run_script(command: str) -> None:
@@ -62,7 +54,7 @@ def run_script(command: str) -> None:
         # A file enjoy.py would have to lie in the user's folder, and `python` may be another interpreter
         subprocess.call = lambda arguments: call([*enjoy, *arguments[2:]])  # type: ignore[assignment,misc]
     try:
-        runpy.run_module(SCRIPTS[command], run_name="__main__")
+        runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
     finally:
         subprocess.call = call
 
@@ -107,23 +99,21 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
     for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
         known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
-        known.add_argument(*names, nargs="+", action=StorePython)
+        known.add_argument(*names, nargs="+", type=key_and_value, default=[])
     given, _ = known.parse_known_args(arguments)
     if command == "benchmark":
         check_benchmark(parser, given)
         return
     if given.algo not in utils.ALGOS:
-        hint = closest(given.algo, utils.ALGOS) or f", only {', '.join(utils.ALGOS)}"
-        parser.error(f"there is no --algo {given.algo}{hint}")
+        parser.error(str(unknown_name("--algo", "one of", utils.ALGOS, given.algo)))
     if given.env not in gym.registry:
-        parser.error(
-            f"--env {given.env} is not registered (an environment of another package needs --gym-packages PACKAGE)"
-            f"{closest(given.env, gym.registry)}"
-        )
+        near = difflib.get_close_matches(given.env, gym.registry, n=1)
+        hint = f": did you mean {near[0]}?" if near else ""
+        parser.error(f"--env {given.env} is not registered (one of another package needs --gym-packages PACKAGE){hint}")
     for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
         try:
             if env_kwargs:
-                gym.make(given.env, **env_kwargs).close()
+                gym.make(given.env, **dict(env_kwargs)).close()
         except TypeError as error:
             parser.error(f"{option}: {error}")
     if command != "train":
@@ -170,20 +160,21 @@ def main() -> None:
     if command in NOT_OFFERED:
         parser.error(f"{command} is not offered: {NOT_OFFERED[command]}")
     if command not in COMMANDS:
-        parser.error(f"there is no command {command!r}, only {', '.join(COMMANDS)}")
+        parser.error(str(unknown_name("the command", "one of", COMMANDS, command)))
     arguments = sys.argv[2:]
     try:
-        if command in CHECKED and not {"-h", "--help"} & {*arguments}:
+        if command not in PLOTS and not {"-h", "--help"} & {*arguments}:
             arguments = import_packages(command, arguments)
             check(parser, command, arguments)
         sys.argv = [f"{parser.prog} {command}", *arguments]
         if command == "train":
             with one_of_several(arguments) as sys.argv[1:]:
-                importlib.import_module(FUNCTIONS[command]).train()
-        elif command in FUNCTIONS:
-            getattr(importlib.import_module(FUNCTIONS[command]), command)()
-        else:
+                importlib.import_module("rl_zoo3.train").train()
+        elif command in SCRIPTS:
             run_script(command)
+        else:
+            module = f"rl_zoo3.plots.{command}" if command in PLOTS else f"rl_zoo3.{command}"
+            getattr(importlib.import_module(module), command)()
     except ModuleNotFoundError as error:
         parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:

@@ -1,12 +1,10 @@
 """Experiments of the RL Zoo with the algorithms of this package: their settings are found, checked and converted."""
 
-import difflib
 import importlib
 import inspect
 import re
 import runpy
 from collections import OrderedDict
-from collections.abc import Iterable
 from pathlib import Path
 from pprint import pprint
 from typing import Any, get_args
@@ -20,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_reinforce.common.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_number, unknown_name
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.reinforce import REINFORCE
@@ -38,6 +36,8 @@ ZOO_KEYS = {
     "monitor_kwargs",
 }  # fmt: skip
 ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
+# Settings whose dict may be given as a text
+PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
 LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
 
 
@@ -75,7 +75,7 @@ class Experiment(exp_manager.ExperimentManager):
         except (AssertionError, TypeError, ValueError) as error:
             # Stable-Baselines3 asserts that a policy supports the spaces; errors about an argument name it at these
             # places; all other errors keep their traceback
-            named = re.findall(r"(?:^Invalid value for |^|, got |unexpected keyword argument ')(\w+)", str(error))
+            named = re.findall(r"(?:^|, got |unexpected keyword argument ')(\w+)", str(error))
             if isinstance(error, AssertionError) or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
@@ -102,17 +102,15 @@ class Experiment(exp_manager.ExperimentManager):
         pprint(saved)
         return found, saved
 
-    def _preprocess_hyperparams(self, hyperparams: Settings) -> tuple[Any, ...]:
-        """Convert texts as the Zoo does, and ``lin_NUMBER`` in every argument that may be a schedule."""
+    def _preprocess_schedules(self, hyperparams: Settings) -> Settings:  # type: ignore[override]
+        """Convert ``lin_NUMBER`` in every argument that may be a schedule; the algorithms take numbers themselves."""
         # The Zoo converts two of them, to a class without which the saved model could not be loaded. No public method
         # stands between the settings and the model
-        linear = {}
+        converted = dict(hyperparams)
         for key in scheduled_keys(self.algo) & hyperparams.keys():
             if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):
-                linear[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
-        others = {key: value for key, value in hyperparams.items() if key not in linear}
-        processed, *rest = super()._preprocess_hyperparams(others)
-        return processed | linear, *rest
+                converted[key] = LinearSchedule(float(start[1]), 0.0, 1.0)
+        return converted
 
 
 def make_experiment(args: Any, algo: str, *others: Any, **kwargs: Any) -> exp_manager.ExperimentManager:
@@ -128,18 +126,12 @@ def find_settings(experiment: Experiment) -> Settings:
         return dict(yaml.unsafe_load(experiment.model_config.read_text()))
     config, env_id = experiment.config, experiment.env_name.gym_id
     print(f"Loading hyperparameters from: {config}")
-    published = load_configuration(config)
-    if not isinstance(published, dict):
-        raise ConfigurationError(f"{config} must map environments to settings, got a {type(published).__name__}")
+    published = as_dict(f"The content of {config}", load_configuration(config))
     fallback = "atari" if experiment.is_atari(env_id) else "default"
-    if env_id not in published and fallback not in published:
-        raise ConfigurationError(f"{config} must have an entry {env_id} or {fallback}")
     key = env_id if env_id in published else fallback
-    if not isinstance(published[key], dict):
-        raise ConfigurationError(
-            f"The entry {key} of {config} must hold settings, such as policy: 'MlpPolicy', got {published[key]!r}"
-        )
-    found = dict(published[key])
+    if key not in published:
+        raise ConfigurationError(f"{config} must have an entry {env_id} or {fallback}")
+    found = dict(as_dict(f"The entry {key} of {config}", published[key]))
     return fit_default(found, experiment) if key == "default" else found
 
 
@@ -191,18 +183,12 @@ def scheduled_keys(algorithm: str) -> set[str]:
     return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
 
 
-def closest(name: str, names: Iterable[str]) -> str:
-    """``: did you mean X?`` with the closest of the names, or nothing where none is close."""
-    return "".join(f": did you mean {near}?" for near in difflib.get_close_matches(name, names, n=1))
-
-
 def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     """Raise an error for settings that the Zoo would fail on; the algorithm checks its own arguments."""
     allowed = allowed_keys(algorithm)
     for key in hyperparams:
         if key not in allowed:
-            hint = closest(str(key), allowed) or f", only {', '.join(sorted(allowed))}"
-            raise ConfigurationError(f"{key!r} is not a setting of {algorithm}{hint}")
+            raise ConfigurationError(str(unknown_name(f"A setting of {algorithm}", "one of", sorted(allowed), key)))
     for key in ("policy", "n_timesteps"):
         if key not in hyperparams:
             raise ConfigurationError(f"The settings of {algorithm} must hold {key}, which the Zoo reads even with -n")
@@ -226,7 +212,7 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
 def as_dict(key: str, value: Any) -> Settings:
     """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
     result = {} if value is None else value
-    if isinstance(value, str) and key != "env_kwargs":
+    if isinstance(value, str) and key in PYTHON_KEYS:
         try:
             result = eval(value, dict(vars(exp_manager)))
         except Exception as error:

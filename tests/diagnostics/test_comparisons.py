@@ -13,6 +13,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import (
     baseline_comparison,
     compare_baselines,
+    compare_starts,
     gradient_statistics,
     gradients_by_episode,
     sample,
@@ -124,10 +125,11 @@ def test_time_or_state_halve_the_variance_on_cartpole():
 
 
 def test_a_progress_bar_counts_the_episodes(capsys):
-    """What an environment plays beyond its share does not count."""
-    env = make_vec_env(lambda: Tree(ragged=True), 3, seed=0)
-    compare_baselines(REINFORCE("MlpPolicy", env, device="cpu"), 20, progress_bar=True)
-    assert "| 20/20 [" in capsys.readouterr().err
+    """What an environment plays beyond its share does not count; of each start there are eight."""
+    model = REINFORCE("MlpPolicy", make_vec_env(lambda: Tree(ragged=True), 3, seed=0), device="cpu")
+    for compare, n, shown in ((compare_baselines, 20, "20/20"), (compare_starts, 6, "48/48")):
+        compare(model, n, progress_bar=True)
+        assert f"| {shown} [" in capsys.readouterr().err
 
 
 def test_bias_is_told_where_theory_knows_it():

@@ -40,14 +40,6 @@ def test_counts_are_repeated_samples_without_their_pairs_with_themselves(counts)
     th.testing.assert_close(variance(found)[0], th.stack(apart).mean())
 
 
-def test_no_resample_has_a_negative_variance():
-    """Three times 1 and once 2: half the squared distance of the only pair that differs, whatever the counts."""
-    gradients, counts = th.tensor([[1.0], [2.0]]).double(), th.tensor([[3.0, 1.0], [1.0, 1.0]]).double()
-    assert variance(compute_moments(gradients @ gradients.T, counts)).tolist() == [0.5, 0.5]
-    found = gradient_statistics(draw(3, th.Generator().manual_seed(0)), n_resamples=2000)
-    assert found.variance.low > 0
-
-
 def test_variance_and_signal_are_unbiased_on_the_tree():
     """Σ over all samples of 3 episodes of p(sample) · statistic is the statistic of the distribution."""
     trajectories = Tree().trajectories()

@@ -20,6 +20,7 @@ from sb3_reinforce.diagnostics import (
     check_gradient,
     compare_baselines,
     compare_estimators,
+    compare_starts,
     landscape,
     sample,
 )
@@ -32,6 +33,7 @@ def lab():
         "compare_baselines": lambda model: compare_baselines(model, 4, n_resamples=2),
         "compare_estimators": lambda model: compare_estimators(model, 4, 3, n_delta=2, n_resamples=2),
         "likelihood_ratio": lambda model: compare_estimators(model, 4, estimators="likelihood_ratio", n_resamples=2),
+        "compare_starts": lambda model: compare_starts(model, 4, n_resamples=2),
         "landscape": lambda model: landscape(model, n_points=2, n_episodes=1),
         "sample": lambda model: sample(model, 2),
     }
@@ -67,8 +69,9 @@ def test_a_model_is_as_it_was_and_goes_on(measure):
 
     def state():
         counts = env.obs_rms.count, env.ret_rms.count, len(model.ep_info_buffer), env.training
-        arguments = model.n_steps, model.n_episodes, model.baseline, model.gamma, model.max_grad_norm
-        return model.num_timesteps, model.logger, model.policy.optimizer, counts, arguments
+        names = ("n_steps", "n_episodes", "episodes_per_start", "baseline", "gamma", "gae_lambda", "max_grad_norm")
+        kept = [getattr(model, name) for name in (*names, "num_timesteps", "logger", "rollout")]
+        return kept, model.policy.optimizer, counts
 
     before, parameters = state(), {name: value.clone() for name, value in model.policy.state_dict().items()}
     measure(model)
@@ -142,7 +145,7 @@ def test_a_model_without_environments_is_refused(measure):
         measure(model)
 
 
-REFUSING = ("check_gradient", "compare_baselines", "compare_estimators", "sample")
+REFUSING = ("check_gradient", "compare_baselines", "compare_estimators", "compare_starts", "sample")
 REFUSING_CALLBACKS = [lambda model, make=make: model.learn(10, make()) for make in callbacks.values()]
 
 
@@ -159,7 +162,8 @@ def test_a_landscape_needs_an_actor_critic_policy():
 
 def test_episodes_that_share_the_noise_of_gsde_are_no_samples():
     model = REINFORCE("MlpPolicy", Corridor(action_space=spaces.Box(-1, 1, (1,))), use_sde=True, device="cpu")
-    for measure in (compare_baselines, compare_estimators, lambda m: m.learn(64, GradientQualityCallback(1))):
+    quality = {"callback": GradientQualityCallback(1), "total_timesteps": 64}
+    for measure in (compare_baselines, compare_estimators, compare_starts, lambda model: model.learn(**quality)):
         with pytest.raises(ValueError, match="use_sde=True and sde_sample_freq=-1"):
             measure(model)
 
@@ -184,10 +188,10 @@ MISTAKES = {
         ({"n_episodes": 10.0}, "n_episodes must be an integer"),
         ({"baselines": ("no_such_baseline",)}, r"baselines must be.*'time_mean'.*got 'no_such_baseline'"),
         ({"baselines": 3}, "baselines must be a name or a callable, got 3"),
-        ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "two of its functions are named '<lambda>'"),
-        ({"baselines": called("none")}, "named 'none'"),
-        ({"baselines": called("floor")}, "a function named 'floor', which is the name of a row"),
-        ({"baselines": called("optimal")}, "a function named 'optimal', which is the name of a row"),
+        ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "'<lambda>' is the name of another row"),
+        ({"baselines": called("none")}, "'none' is the name of another row"),
+        ({"baselines": called("floor")}, "'floor' is the name of another row"),
+        ({"baselines": called("optimal")}, "'optimal' is the name of another row"),
         ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
         ({"baselines": ("value",)}, "no critic.*'none'"),
         ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
@@ -215,6 +219,7 @@ MISTAKES = {
         ({"gradients": th.ones(4)}, "gradients must be a dictionary.*Tensor"),
         ({"directions": [1.0, 2.0]}, "directions must be a tensor"),
     ],
+    compare_starts: [({"n_starts": 3}, "n_starts must be at least 4"), ({"confidence": 95}, "confidence")],
     check_gradient: [({"n_episodes": 1}, "n_episodes must be at least 2")],
     learn_with_quality: [
         ({"every": 0}, "every must be at least 1, got 0"),

@@ -80,8 +80,8 @@ def test_every_pitfall_has_a_task():
     assert tested == set(PITFALLS)
 
 
-HEALTHY = dict(kl=0.01, entropy=0.6, std=0.5, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
-HEALTHY |= dict(largest_entropy=0.69, n_episodes=16, n_steps=256, used_fraction=1.0)
+HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
+HEALTHY |= dict(n_episodes=16, n_steps=256, used_fraction=1.0)
 
 
 def seen(*updates, n=1, progress=1.0, signal=0.0, **kwargs):
@@ -98,8 +98,9 @@ def history(updates, progress, signal, kwargs):
 
 
 few = {"n_episodes": 4}
-spread = {"entropy": 0.69}
-peaked = {"entropy": 0.2}
+spread = {"randomness": 1.0}
+peaked = {"randomness": 0.3}
+fixed = {"randomness": 0.01}
 spike = {"grad_norm": 11.0}
 unexplained = {"explained_variance": -0.1, "return_std": 1.1}
 constant_returns = {"explained_variance": -0.1, "return_std": 0.9}
@@ -119,7 +120,7 @@ cut = {"n_steps": 32, "baseline": "mean"}
         ("spikes_without_clipping", seen(*[{}] * 20, spike, max_grad_norm=None), seen(*[{}] * 20, spike)),
         ("useless_critic", seen(unexplained, n=50, progress=0.4), seen(unexplained, n=50, progress=0.6)),
         ("useless_critic", seen(unexplained, n=50, progress=0.4), seen(constant_returns, n=50, progress=0.4)),
-        ("deterministic_too_early", seen({"entropy": 0.01}, progress=0.6), seen({"entropy": 0.01}, progress=0.5)),
+        ("deterministic_too_early", seen(fixed, progress=0.6), seen(fixed, progress=0.5)),
         ("cut_episodes", seen({"used_fraction": 0.89}, **cut), seen({"used_fraction": 0.91}, **cut)),
         ("cut_episodes", seen({"used_fraction": 0.5}, **cut), seen({"used_fraction": 0.5}, n_steps=32)),
     ],
@@ -164,9 +165,14 @@ def test_small_noise_weights_are_not_a_deterministic_policy():
     assert "deterministic_too_early" in fall("Pendulum-v1", 1000, policy_kwargs={"log_std_init": -9.0}, **gsde)
 
 
+@th.no_grad()
 def test_noise_wider_than_the_actions_is_all_the_randomness_there_is():
-    space = spaces.Box(-0.1, 0.1, (1,))
-    assert [randomness(space, update) for update in history(*seen({"std": 1.0}, {"std": 0.5})).updates] == [1.0, 1.0]
+    policy = REINFORCE("MlpPolicy", Corridor(action_space=spaces.Box(-0.1, 0.1, (1,))), device="cpu").policy
+    found = []
+    for std in (1.0, 0.05):
+        policy.log_std.fill_(np.log(std))
+        found.append(randomness(policy, th.zeros(1, *policy.observation_space.shape), entropy=0.0))
+    assert found == pytest.approx([1.0, 0.5])
 
 
 class Own(spaces.Discrete):

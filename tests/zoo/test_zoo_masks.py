@@ -2,15 +2,9 @@
 
 import sys
 
-import pytest
-
-pytest.importorskip("rl_zoo3")
-pytest.importorskip("matplotlib")
-
 import gymnasium as gym
+import pytest
 from zoo_commands import zoo
-
-pytestmark = pytest.mark.filterwarnings("ignore")
 
 STRICT = """
 import gymnasium as gym
@@ -32,10 +26,7 @@ Strict-v0:
 """
 
 
-@pytest.mark.parametrize(
-    ("name", "policy"),
-    [("reinforce", "MaskedPolicy"), ("a2c", "sb3_reinforce.MaskedPolicy")],
-)
+@pytest.mark.parametrize(("name", "policy"), [("reinforce", "MaskedPolicy"), ("a2c", "sb3_reinforce.MaskedPolicy")])
 def test_masks_in_the_settings(name, policy, tmp_path, monkeypatch, capsys):
     (tmp_path / "strict.py").write_text(STRICT)
     (tmp_path / "settings.yml").write_text(SETTINGS.format(policy))

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rl_zoo3")
-
 from sb3_reinforce import REINFORCE
 
 LAUNCHER = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
@@ -17,19 +15,8 @@ COMPARE = Path(__file__).parents[2] / "examples/benchmarks/compare.py"
 
 @pytest.mark.slow
 def test_train_in_two_processes_writes_one_folder(tmp_path):
-    options = [
-        "--algo",
-        "reinforce",
-        "--env",
-        "CartPole-v1",
-        "-n",
-        "2000",
-        "-f",
-        tmp_path / "logs",
-        "--eval-freq",
-        "500",
-    ]
-    train = [*LAUNCHER, "-m", "sb3_reinforce.zoo", "train", *options, "--eval-freq", "500"]
+    train = [*LAUNCHER, "-m", "sb3_reinforce.zoo", "train", "--algo", "reinforce", "--env", "CartPole-v1"]
+    train += ["-n", "2000", "--eval-freq", "500", "-f", tmp_path / "logs"]
     done = subprocess.run(train, check=True, capture_output=True, text=True)
     assert done.stdout.count("Saving to") == 1
     assert [path.name for path in (tmp_path / "logs/reinforce").iterdir()] == ["CartPole-v1_1"]
