@@ -205,11 +205,7 @@ class MaskedPolicy(ActorCriticPolicy):
         if features_extractor_class is None:
             features_extractor_class = extractor_class_for(without_mask(parts))
         super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            features_extractor_class=features_extractor_class,
-            **kwargs,
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
         )
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
