@@ -106,13 +106,8 @@ def action_distribution(policy: ActorCriticPolicy, obs: Any) -> Distribution:
     return policy.sequence_distribution(obs) if isinstance(policy, RecurrentPolicy) else policy.get_distribution(obs)
 
 
-def state_values(policy: ActorCriticPolicy, obs: Any) -> th.Tensor:
-    """V(s), shape ``(n, 1)``, for a batch of observations, or for the rows of sequences if the policy is recurrent."""
-    return policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
-
-
 def evaluate(
-    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, with_values: bool
+    policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, with_values: bool
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
     """
     log π(a|s), the entropy of π(·|s), and V(s) or None, each of shape ``(n,)``.
@@ -131,7 +126,7 @@ def evaluate(
         log_prob = distribution.log_prob(actions)
         entropy = distribution.entropy()
         if with_values:
-            values = state_values(policy, obs)
+            values = policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
     if entropy is None:
         entropy = -log_prob
     return log_prob, entropy, None if values is None else values.flatten()
