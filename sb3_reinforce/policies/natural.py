@@ -46,9 +46,8 @@ def natural_step(
 
     The parameters stay as they are, with a warning, where no such step is found.
     """
-    pairs = [(each, gradient) for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
-    parameters = [each for each, _ in pairs]
-    g = to_vector([gradient for _, gradient in pairs])
+    parameters = [each for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
+    g = to_vector(gradients)
     norm = finite_norm(g, "policy", "scaled rewards (VecNormalize)")
     # A schedule may fall to a target of 0
     if norm == 0 or target_kl == 0:
