@@ -5,7 +5,7 @@ Some environments step all their copies in one array operation, far faster than 
 """
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,8 +19,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from sb3_reinforce.common.tensors import map_parts, take
 from sb3_reinforce.envs.checks import BadData, check_observation
-
-Restart: TypeAlias = Callable[[Any, NDArray[np.bool_]], Any]
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -148,7 +146,7 @@ class GymnasiumVecEnv(VecEnv):
         return list(pictures)
 
 
-def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
+def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.bool_]], Any] | None:
     """A function that starts new episodes in copies whose episode has ended; None if the environment does it itself."""
     # Environments of one class share their metadata
     mode = getattr(env.unwrapped, "autoreset_mode", env.metadata.get("autoreset_mode"))
