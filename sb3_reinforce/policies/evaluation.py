@@ -43,10 +43,10 @@ class Route:
     """
 
     with_critic: bool
-    actor: list[nn.Module] | None
-    critic: list[nn.Module] | None
-    forward: bool
-    evaluate_actions: bool
+    actor: list[nn.Module] | None = None
+    critic: list[nn.Module] | None = None
+    forward: bool = False
+    evaluate_actions: bool = False
 
 
 def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
@@ -57,18 +57,17 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     ``get_distribution`` and ``predict_values``.
     """
     if isinstance(policy, RecurrentPolicy):
-        return Route(with_critic, actor=None, critic=None, forward=False, evaluate_actions=False)
+        return Route(with_critic)
     actor = plain_actor(policy)
     critic = plain_critic(policy) if with_critic else None
     if actor is not None:
-        return Route(with_critic, actor, critic, forward=False, evaluate_actions=False)
+        return Route(with_critic, actor, critic)
     own_parts = overrides(policy, "predict_values", "get_distribution")
     shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
     together = with_critic and shares and not own_parts
     own_forward = has_own_forward(policy)
     return Route(
         with_critic,
-        actor=None,
         critic=critic,
         forward=own_forward or overrides(policy, "forward") or together,
         evaluate_actions=own_forward or overrides(policy, "evaluate_actions") or together,
