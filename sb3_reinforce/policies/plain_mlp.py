@@ -6,7 +6,7 @@ Stable-Baselines3 or PyTorch. A hook, a replaced method or a class of the user m
 itself is called. (Hooks that PyTorch registers for all modules at once are not looked for.)
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -22,11 +22,7 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import (
-    CombinedExtractor,
-    FlattenExtractor,
-    MlpExtractor,
-)
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
 from torch import nn
 from torch.nn import functional as F
 
@@ -138,14 +134,10 @@ def plain_layers(
 
 def is_plain_extractor(extractor: Any) -> bool:
     """Whether a features extractor only puts numbers in a row."""
-    parts: Iterable[nn.Module] = ()
-    if type(extractor) is FlattenExtractor:
-        parts = (extractor.flatten,)
-    elif type(extractor) is CombinedExtractor:
-        parts = extractor.extractors.values()
-    else:
+    if type(extractor) not in (FlattenExtractor, CombinedExtractor):
         return False
-    return is_unchanged(extractor) and all(type(part) is nn.Flatten and is_unchanged(part) for part in parts)
+    parts = (type(extractor), nn.ModuleDict, nn.Flatten)
+    return all(type(part) in parts and is_unchanged(part) for part in extractor.modules())
 
 
 def is_plain_layer(layer: Any) -> bool:
