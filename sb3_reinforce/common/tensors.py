@@ -1,6 +1,6 @@
 """Helpers for tensors and nested dicts of tensors."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,18 +10,22 @@ import torch as th
 TensorOrDict: TypeAlias = Any
 
 
+def map_parts(function: Callable[..., Any], *tensors: TensorOrDict) -> TensorOrDict:
+    """``function(*tensors)``, or a dict of its values for the tensors under each key; for arrays too."""
+    first = tensors[0]
+    if isinstance(first, dict):
+        return {key: map_parts(function, *(each[key] for each in tensors)) for key in first}
+    return function(*tensors)
+
+
 def flatten(tensors: TensorOrDict) -> TensorOrDict:
     """``(n_steps, n_envs, ...)`` to ``(n_steps * n_envs, ...)``."""
-    if isinstance(tensors, th.Tensor):
-        return tensors.flatten(0, 1)
-    return {key: flatten(part) for key, part in tensors.items()}
+    return map_parts(lambda tensor: tensor.flatten(0, 1), tensors)
 
 
 def take(tensors: TensorOrDict, index: Any) -> TensorOrDict:
-    """``tensors[index]``, for each tensor of a dict; for arrays too."""
-    if isinstance(tensors, dict):
-        return {key: take(part, index) for key, part in tensors.items()}
-    return tensors[index]
+    """``tensors[index]``, for arrays too."""
+    return map_parts(lambda tensor: tensor[index], tensors)
 
 
 def select(tensors: TensorOrDict, mask: th.Tensor) -> TensorOrDict:
@@ -31,24 +35,21 @@ def select(tensors: TensorOrDict, mask: th.Tensor) -> TensorOrDict:
 
 def shaped_like(tensors: TensorOrDict, obs: Any) -> TensorOrDict:
     """A batch of observations in the shape of stored ones, which have one dimension more for single numbers."""
-    if isinstance(tensors, dict):
-        return {key: shaped_like(part, obs[key]) for key, part in tensors.items()}
-    return th.as_tensor(obs, device=tensors.device).reshape(-1, *tensors.shape[1:])
+
+    def reshape(tensor: th.Tensor, part: Any) -> th.Tensor:
+        return th.as_tensor(part, device=tensor.device).reshape(-1, *tensor.shape[1:])
+
+    return map_parts(reshape, tensors, obs)
 
 
 def concatenate(*tensors: TensorOrDict) -> TensorOrDict:
-    """The rows of all tensors, shape ``(n, ...)``, for each tensor of the dicts."""
-    first = tensors[0]
-    if isinstance(first, dict):
-        return {key: concatenate(*(each[key] for each in tensors)) for key in first}
-    return th.cat(tensors)
+    """The rows of all tensors, shape ``(n, ...)``."""
+    return map_parts(lambda *parts: th.cat(parts), *tensors)
 
 
 def stack(observations: list[Any]) -> Any:
     """Single observations, arrays or dicts of arrays, as a batch."""
-    if isinstance(observations[0], dict):
-        return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
-    return np.stack(observations)
+    return map_parts(lambda *parts: np.stack(parts), *observations)
 
 
 def to_vector(tensors: Iterable[th.Tensor | None]) -> th.Tensor:

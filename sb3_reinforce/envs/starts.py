@@ -40,11 +40,8 @@ def start_groups(env: VecEnv, size: int) -> Any:
 
 def are_alike(obs: Any, size: int) -> bool:
     """Whether the observations of each ``size`` neighbours are equal."""
-    for part in obs.values() if isinstance(obs, dict) else [obs]:
-        by_start = part.reshape(-1, size, *part.shape[1:])
-        if not np.array_equal(by_start, np.broadcast_to(by_start[:, :1], by_start.shape)):
-            return False
-    return True
+    parts = obs.values() if isinstance(obs, dict) else [obs]
+    return all(np.array_equal(part, part[::size].repeat(size, axis=0)) for part in parts)
 
 
 def check_groups(obs: Any, size: int) -> None:

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.util import dict_to_obs
 
 from sb3_reinforce.envs.checks import BadData, as_reward, check_observation
 
@@ -78,5 +79,4 @@ def write(env: DummyVecEnv, i: int, obs: Any) -> None:
 
 def copy_observations(env: DummyVecEnv) -> VecEnvObs:
     """All observations, ``(n_envs, ...)`` or a dict of them, which the next step does not change."""
-    copies: Any = {key: part.copy() for key, part in env.buf_obs.items()}
-    return copies.get(None, copies)  # type: ignore[no-any-return]
+    return dict_to_obs(env.observation_space, {key: part.copy() for key, part in env.buf_obs.items()})

@@ -5,7 +5,7 @@ Some environments step all their copies in one array operation, far faster than 
 """
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.common.tensors import take
+from sb3_reinforce.common.tensors import map_parts, take
 from sb3_reinforce.envs.checks import BadData, check_observation
-
-Restart: TypeAlias = Callable[[Any, NDArray[np.bool_]], Any]
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -57,7 +55,7 @@ class GymnasiumVecEnv(VecEnv):
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        observations: VecEnvObs = copy(obs)
+        observations: VecEnvObs = map_parts(np.array, obs)
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -91,11 +89,12 @@ class GymnasiumVecEnv(VecEnv):
             for i in ended:
                 infos[i] |= info_of(episodes, i)
                 check_observation(self.observation_space, take(last_obs, i), i)
-                infos[i]["terminal_observation"] = copy(take(last_obs, i))
+                infos[i]["terminal_observation"] = map_parts(np.array, take(last_obs, i))
             obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
-        return copy(obs), rewards.astype(np.float32), dones, infos
+        # A copy: the environment may write its next observations into the same arrays
+        return map_parts(np.array, obs), rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
         """Close the vector environment."""
@@ -147,7 +146,7 @@ class GymnasiumVecEnv(VecEnv):
         return list(pictures)
 
 
-def find_restart(env: VectorEnv[Any, Any, Any]) -> Restart | None:
+def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.bool_]], Any] | None:
     """A function that starts new episodes in copies whose episode has ended; None if the environment does it itself."""
     # Environments of one class share their metadata
     mode = getattr(env.unwrapped, "autoreset_mode", env.metadata.get("autoreset_mode"))
@@ -202,11 +201,6 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
     # Rows of one array share their form; what is not in a Box must be in its space too
     for i in range(1 if isinstance(space, spaces.Box) else n_envs):
         check_observation(space, rows[i], i)
-
-
-def copy(obs: Any) -> Any:
-    """Observations that the environment does not write into later."""
-    return {key: np.array(part) for key, part in obs.items()} if isinstance(obs, dict) else np.array(obs)
 
 
 def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:

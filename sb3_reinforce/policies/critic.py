@@ -8,7 +8,6 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.nn import functional as F
@@ -16,7 +15,7 @@ from torch.nn import functional as F
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.tensors import flatten, stack, take
 from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, has_own_forward
-from sb3_reinforce.policies.plain_mlp import evaluate_layers, overrides
+from sb3_reinforce.policies.plain_mlp import evaluate_layers, is_plain_extractor, overrides
 from sb3_reinforce.policies.sequences import RecurrentPolicy, sequence_minibatches
 
 Value: TypeAlias = Callable[[Any], th.Tensor]
@@ -114,19 +113,19 @@ def value_of_batch(
     """
     layers = route.critic
     extractor = policy.vf_features_extractor
-    trained = {id(parameter) for parameter in parameters}
+    is_trained = not set(parameters).isdisjoint(extractor.parameters())
+    # In training mode Dropout draws new masks for each pass, and BatchNorm looks at each minibatch
+    is_fixed = is_plain_extractor(extractor) or not (is_trained or extractor.training)
     if isinstance(policy, RecurrentPolicy):
         rows: Any = obs
-        if not extractor.training and trained.isdisjoint(map(id, extractor.parameters())):
+        if is_fixed:
             with th.no_grad():
                 rows = {**rows, "features": policy.row_features(rows, extractor)}
         return lambda batch: policy.sequence_values(take(rows, batch))
     if layers is None and (has_own_forward(policy) or overrides(policy, "evaluate_actions")):
         # V of such a policy may only be found along with log π
         return lambda batch: policy.evaluate_actions(take(obs, batch), actions[batch])[0]
-    # In training mode Dropout draws new masks for each pass, and BatchNorm looks at each minibatch
-    is_fixed = layers is not None or type(extractor) is FlattenExtractor or not extractor.training
-    if overrides(policy, "predict_values") or not is_fixed or not trained.isdisjoint(map(id, extractor.parameters())):
+    if overrides(policy, "predict_values") or not is_fixed:
         return lambda batch: policy.predict_values(take(obs, batch))
     with th.no_grad():
         features = extract_features(policy, obs, extractor)

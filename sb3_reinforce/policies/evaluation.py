@@ -43,10 +43,10 @@ class Route:
     """
 
     with_critic: bool
-    actor: list[nn.Module] | None
-    critic: list[nn.Module] | None
-    forward: bool
-    evaluate_actions: bool
+    actor: list[nn.Module] | None = None
+    critic: list[nn.Module] | None = None
+    forward: bool = False
+    evaluate_actions: bool = False
 
 
 def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
@@ -57,18 +57,17 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     ``get_distribution`` and ``predict_values``.
     """
     if isinstance(policy, RecurrentPolicy):
-        return Route(with_critic, actor=None, critic=None, forward=False, evaluate_actions=False)
+        return Route(with_critic)
     actor = plain_actor(policy)
     critic = plain_critic(policy) if with_critic else None
     if actor is not None:
-        return Route(with_critic, actor, critic, forward=False, evaluate_actions=False)
+        return Route(with_critic, actor, critic)
     own_parts = overrides(policy, "predict_values", "get_distribution")
     shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
     together = with_critic and shares and not own_parts
     own_forward = has_own_forward(policy)
     return Route(
         with_critic,
-        actor=None,
         critic=critic,
         forward=own_forward or overrides(policy, "forward") or together,
         evaluate_actions=own_forward or overrides(policy, "evaluate_actions") or together,
@@ -106,13 +105,8 @@ def action_distribution(policy: ActorCriticPolicy, obs: Any) -> Distribution:
     return policy.sequence_distribution(obs) if isinstance(policy, RecurrentPolicy) else policy.get_distribution(obs)
 
 
-def state_values(policy: ActorCriticPolicy, obs: Any) -> th.Tensor:
-    """V(s), shape ``(n, 1)``, for a batch of observations, or for the rows of sequences if the policy is recurrent."""
-    return policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
-
-
 def evaluate(
-    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, with_values: bool
+    policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, with_values: bool
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
     """
     log π(a|s), the entropy of π(·|s), and V(s) or None, each of shape ``(n,)``.
@@ -131,7 +125,7 @@ def evaluate(
         log_prob = distribution.log_prob(actions)
         entropy = distribution.entropy()
         if with_values:
-            values = state_values(policy, obs)
+            values = policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
     if entropy is None:
         entropy = -log_prob
     return log_prob, entropy, None if values is None else values.flatten()

@@ -115,13 +115,6 @@ def split_mask(features: th.Tensor, n_actions: int) -> tuple[th.Tensor, th.Tenso
     return features[..., :-n_actions], features[..., -n_actions:]
 
 
-def mask_logits(logits: th.Tensor, mask: th.Tensor, sizes: list[int]) -> th.Tensor:
-    """``logits(s, a)`` where a is allowed, else −∞; in a dimension where nothing is allowed, all is."""
-    # Else π would be NaN in terminal states, and for the zeros by which a policy is probed
-    allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), sizes, dim=-1)]
-    return logits.masked_fill(~th.cat(allowed, dim=-1), -th.inf)
-
-
 class MaskedExtractor(BaseFeaturesExtractor):
     """The features and the mask behind them, ``(n, features_dim + n_actions)``; ``features_dim`` sizes the layers."""
 
@@ -156,7 +149,7 @@ class MaskedMlpExtractor(nn.Module):
 
 
 class MaskedLogits(nn.Module):
-    """The logits of an action net, −∞ for forbidden actions."""
+    """``logits(s, a)`` where a is allowed, else −∞; in a dimension where nothing is allowed, all is."""
 
     def __init__(self, action_net: nn.Module, sizes: list[int]):
         super().__init__()
@@ -165,7 +158,10 @@ class MaskedLogits(nn.Module):
 
     def forward(self, latent: th.Tensor) -> th.Tensor:
         latent, mask = split_mask(latent, sum(self.sizes))
-        return mask_logits(self.action_net(latent), mask, self.sizes)
+        # Else π would be NaN in terminal states, and for the zeros by which a policy is probed
+        allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), self.sizes, dim=-1)]
+        logits: th.Tensor = self.action_net(latent)
+        return logits.masked_fill(~th.cat(allowed, dim=-1), -th.inf)
 
 
 class MaskedPolicy(ActorCriticPolicy):
@@ -205,11 +201,7 @@ class MaskedPolicy(ActorCriticPolicy):
         if features_extractor_class is None:
             features_extractor_class = extractor_class_for(without_mask(parts))
         super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            features_extractor_class=features_extractor_class,
-            **kwargs,
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
         )
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:

@@ -9,6 +9,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import torch as th
@@ -46,9 +47,8 @@ def natural_step(
 
     The parameters stay as they are, with a warning, where no such step is found.
     """
-    pairs = [(each, gradient) for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
-    parameters = [each for each, _ in pairs]
-    g = to_vector([gradient for _, gradient in pairs])
+    parameters = [each for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
+    g = to_vector(gradients)
     norm = finite_norm(g, "policy", "scaled rewards (VecNormalize)")
     # A schedule may fall to a target of 0
     if norm == 0 or target_kl == 0:
@@ -83,16 +83,12 @@ def check_distribution(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, 
 
 def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.Tensor]:
     """A function that returns the mean of KL(π_now(·|s) ‖ π(·|s)) over the observations."""
-
-    def current() -> Any:
-        # The policy has one distribution object, which each evaluation fills
-        return copy.copy(action_distribution(policy, obs))
-
     with th.no_grad():
-        now = current()
+        # A copy, since the policy has one distribution object, which each evaluation fills
+        now: Any = copy.copy(action_distribution(policy, obs))
 
     def divergence() -> th.Tensor:
-        kl = kl_divergence(now, current())
+        kl = kl_divergence(now, action_distribution(policy, obs))
         return kl.flatten(1).sum(1).mean() if kl.dim() > 1 else kl.mean()
 
     return divergence
@@ -131,20 +127,17 @@ def walk(
 ) -> float | None:
     """``θ − length · d``, shortened until the divergence is at most 1.2 times the target; returns it, or None."""
     before = to_vector(parameters)
-    kl = math.inf
-    try:
+    with ExitStack() as undo:
+        undo.callback(vectors.write, parameters, before)
         for _ in range(MAX_REDUCTIONS):
             vectors.write(parameters, before - length * d)
             kl = measured(divergence)
             if kl <= TOLERANCE * target_kl:
+                undo.pop_all()
                 return max(kl, 0.0)
             # The divergence is about quadratic in the length
             length *= max(0.5, math.sqrt(target_kl / kl))
-            kl = math.inf
-        return None
-    finally:
-        if kl == math.inf:
-            vectors.write(parameters, before)
+    return None
 
 
 @th.no_grad()

@@ -6,7 +6,7 @@ Stable-Baselines3 or PyTorch. A hook, a replaced method or a class of the user m
 itself is called. (Hooks that PyTorch registers for all modules at once are not looked for.)
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -22,11 +22,7 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import (
-    CombinedExtractor,
-    FlattenExtractor,
-    MlpExtractor,
-)
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
 from torch import nn
 from torch.nn import functional as F
 
@@ -37,7 +33,11 @@ ELEMENTWISE = (
     *(nn.Tanh, nn.ReLU, nn.Identity, nn.ELU, nn.SELU, nn.CELU, nn.SiLU, nn.GELU, nn.Mish, nn.Sigmoid, nn.LogSigmoid),
     *(nn.LeakyReLU, nn.ReLU6, nn.Softplus, nn.Softsign, nn.Hardtanh, nn.Hardswish, nn.Hardsigmoid, nn.Tanhshrink),
 )
-NUMPY_LAYERS = (nn.Linear, nn.Tanh, nn.ReLU)
+# The activations that NumPy computes, each in place
+IN_PLACE: dict[type[nn.Module], Callable[[Floats], Floats]] = {
+    nn.Tanh: lambda x: np.tanh(x, out=x),
+    nn.ReLU: lambda x: np.maximum(x, 0, out=x),
+}
 # What a subclass of ActorCriticPolicy may override and still act as one: these methods only build its networks
 CONSTRUCTION = {"__init__", "_build", "_build_mlp_extractor", "_get_constructor_parameters", "make_features_extractor"}
 # The dicts in which a module keeps its hooks, by the name that PyTorch gives them
@@ -134,14 +134,10 @@ def plain_layers(
 
 def is_plain_extractor(extractor: Any) -> bool:
     """Whether a features extractor only puts numbers in a row."""
-    parts: Iterable[nn.Module] = ()
-    if type(extractor) is FlattenExtractor:
-        parts = (extractor.flatten,)
-    elif type(extractor) is CombinedExtractor:
-        parts = extractor.extractors.values()
-    else:
+    if type(extractor) not in (FlattenExtractor, CombinedExtractor):
         return False
-    return is_unchanged(extractor) and all(type(part) is nn.Flatten and is_unchanged(part) for part in parts)
+    parts = (type(extractor), nn.ModuleDict, nn.Flatten)
+    return all(type(part) in parts and is_unchanged(part) for part in extractor.modules())
 
 
 def is_plain_layer(layer: Any) -> bool:
@@ -177,7 +173,7 @@ def divide(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
 
 def has_numpy_form(layers: list[nn.Module]) -> bool:
     """Whether ``numpy_forward`` can compute these layers: tanh and ReLU after linear ones, in float32 on a CPU."""
-    if not isinstance(layers[0], nn.Linear) or not all(isinstance(layer, NUMPY_LAYERS) for layer in layers):
+    if not isinstance(layers[0], nn.Linear) or not all(type(layer) in (nn.Linear, *IN_PLACE) for layer in layers):
         return False
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
     return all(parameter.dtype is th.float32 and parameter.device.type == "cpu" for parameter in parameters)
@@ -190,14 +186,9 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
     For a handful of observations modules take far longer than the arithmetic. Weights are views of the parameters, so
     that changes in place count at once. The next call may overwrite the result.
     """
-    operations: list[Callable[[Floats], Floats]] = []
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            operations.append(linear_operation(layer, n))
-        elif isinstance(layer, nn.Tanh):
-            operations.append(tanh_in_place)
-        else:
-            operations.append(relu_in_place)
+    operations = [
+        linear_operation(layer, n) if isinstance(layer, nn.Linear) else IN_PLACE[type(layer)] for layer in layers
+    ]
     hooks = temperature_hooks(layers[-1])
 
     # As PyTorch, without warnings: some BLAS kernels read beyond the end of an array and flag what they find there
@@ -209,18 +200,6 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
         return x / np.float32(hooks[0].temperature) if hooks else x
 
     return outputs
-
-
-def tanh_in_place(x: Floats) -> Floats:
-    """``x ← tanh x``."""
-    np.tanh(x, x)
-    return x
-
-
-def relu_in_place(x: Floats) -> Floats:
-    """``x ← max(x, 0)``."""
-    np.maximum(x, 0, out=x)
-    return x
 
 
 def linear_operation(layer: nn.Linear, n: int) -> Callable[[Floats], Floats]:

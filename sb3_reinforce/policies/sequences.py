@@ -210,7 +210,5 @@ def sequence_minibatches(sequence: th.Tensor, size: int) -> Iterator[th.Tensor]:
     order = th.randperm(len(lengths)).to(sequence.device)
     batch = th.empty_like(order)
     batch[order] = (lengths[order].cumsum(0) - 1) // size
-    for each in range(int(batch.max()) + 1):
-        rows = (batch[number] == each).nonzero().flatten()
-        if len(rows):
-            yield rows
+    for each in th.unique(batch):
+        yield (batch[number] == each).nonzero().flatten()

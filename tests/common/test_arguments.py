@@ -108,6 +108,7 @@ RECURRENT, MASKABLE = (
         ("steps", {"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
         ("steps", {"env": "Pendulum-v1", "temperature": 0.5}, ["temperature", "Box"]),
         ("steps", {"env": "Pendulum-v1", "temperature": lambda progress: 1.0}, ["temperature", "Box"]),
+        ("steps", {"target_kl": 0.01}, ["target_kl=0.01", "step='optimizer'", "'natural'"]),
         ("steps", {"use_sde": True}, ["gSDE"]),
         ("search", {"estimator": "regression", "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
         ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),

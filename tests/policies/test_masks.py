@@ -73,8 +73,12 @@ class Masked(Random):
         return super().step(action)
 
 
-def environment(task="discrete", **kwargs):
-    return ActionMaskObservation(Masked(*TASKS[task], lengths=(3, 7), **kwargs))
+def environment(task="discrete"):
+    return ActionMaskObservation(Masked(*TASKS[task], lengths=(3, 7)))
+
+
+def two_environments(**kwargs):
+    return make_vec_env(environment, 2, **{"seed": 0, **kwargs})
 
 
 def make(algorithm, env, **kwargs):
@@ -93,30 +97,29 @@ def takes_only_allowed_actions(algorithm, task, n_steps, **kwargs):
     return sum(env.get_attr("n_steps"))
 
 
-tasks = pytest.mark.parametrize("task", TASKS)
 algorithms = pytest.mark.parametrize("algorithm", ALGORITHMS)
 
 
-@tasks
-@algorithms
-def test_no_forbidden_action_is_taken(algorithm, task):
-    assert takes_only_allowed_actions(algorithm, task, 200) > 200
+NETWORKS = [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared_lstm": True}]
 
 
-@pytest.mark.parametrize("network", [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared_lstm": True}])
-def test_memory_and_mask_go_together_whatever_the_critic_remembers(network):
-    assert takes_only_allowed_actions("recurrent", "discrete", 200, policy_kwargs=network) > 200
+@pytest.mark.parametrize(
+    ("algorithm", "task", "kwargs"),
+    [
+        *product(ALGORITHMS, TASKS, [{}]),
+        *(("recurrent", "discrete", {"policy_kwargs": network}) for network in NETWORKS),
+        *(("reinforce", "multidiscrete", {"temperature": temperature}) for temperature in (1e-3, 0.5, 1e6)),
+    ],
+)
+def test_no_forbidden_action_is_taken(algorithm, task, kwargs):
+    """Whatever the critic remembers, and at any temperature."""
+    assert takes_only_allowed_actions(algorithm, task, 200, **kwargs) > 200
 
 
 @pytest.mark.slow
 def test_no_forbidden_action_is_taken_in_100_000_steps():
     pairs = [*product(ALGORITHMS, ("discrete", "multidiscrete", "image"))]
     assert sum(takes_only_allowed_actions(*pair, 100_000 // len(pairs) + 100) for pair in pairs) > 100_000
-
-
-def test_none_is_taken_at_any_temperature_either():
-    for temperature in (1e-3, 0.5, 1e6):
-        assert takes_only_allowed_actions("reinforce", "multidiscrete", 100, temperature=temperature) > 100
 
 
 @pytest.mark.parametrize("algorithm", ["reinforce", "search"])
@@ -289,19 +292,19 @@ def test_any_features_extractor_sees_the_observation_without_the_mask(task, extr
 @algorithms
 def test_going_on_from_a_file_is_bit_for_bit_never_having_stopped(algorithm, tmp_path):
     def finish(model):
-        model.set_env(make_vec_env(environment, 2, seed=5))
+        model.set_env(two_environments(seed=5))
         set_random_seed(7)
         model.learn(100, reset_num_timesteps=False)
         return plain(model.get_parameters())
 
-    model = make(algorithm, make_vec_env(environment, 2, seed=3)).learn(100)
+    model = make(algorithm, two_environments(seed=3)).learn(100)
     model.save(tmp_path / "model")
     loaded = type(model).load(tmp_path / "model", device="cpu")
     assert plain(loaded.get_parameters()) == plain(model.get_parameters())
     assert finish(loaded) == finish(model)
 
 
-@tasks
+@pytest.mark.parametrize("task", TASKS)
 def test_a_policy_that_is_saved_alone_acts_alike(task, tmp_path):
     env = make_vec_env(lambda: environment(task), 8, seed=0)
     policy = make("ppo", env).policy
@@ -312,19 +315,11 @@ def test_a_policy_that_is_saved_alone_acts_alike(task, tmp_path):
     assert th.equal(*(each(obs, deterministic=True)[0] for each in (policy, loaded)))
 
 
-def vec_normalize(**kwargs):
-    return VecNormalize(make_vec_env(environment, 2, seed=0), **kwargs)
-
-
-def gymnasium_vec_env():
-    return GymnasiumVecEnv(SyncVectorEnv([environment] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
-
-
 VEC_ENVS = {
-    "dummy": lambda: make_vec_env(environment, 2, seed=0),
-    "normalize": lambda: vec_normalize(norm_obs_keys=["observation"]),
-    "rewards": lambda: vec_normalize(norm_obs=False),
-    "gymnasium": gymnasium_vec_env,
+    "dummy": two_environments,
+    "normalize": lambda: VecNormalize(two_environments(), norm_obs_keys=["observation"]),
+    "rewards": lambda: VecNormalize(two_environments(), norm_obs=False),
+    "gymnasium": lambda: GymnasiumVecEnv(SyncVectorEnv([environment] * 2, autoreset_mode=AutoresetMode.SAME_STEP)),
 }
 
 
@@ -337,7 +332,7 @@ def test_masks_reach_the_policy_through_every_vec_env(vec_env, algorithm):
 
 
 def test_masks_are_made_in_the_workers():
-    env = make_vec_env(environment, 2, seed=0, vec_env_cls=SubprocVecEnv)
+    env = two_environments(vec_env_cls=SubprocVecEnv)
     rollout = make("reinforce", env).learn(150).rollout
     env.close()
     masks = rollout.observations["action_mask"]
@@ -346,7 +341,7 @@ def test_masks_are_made_in_the_workers():
 
 def test_a_mask_is_not_normalized():
     with pytest.raises(ValueError, match=r"action_mask.*norm_obs_keys"):
-        vec_normalize()
+        VecNormalize(two_environments())
 
 
 def test_the_gradient_lab_measures_a_masked_policy():
@@ -414,7 +409,7 @@ class OwnNetwork(MaskedPolicy):
 
 
 def test_a_user_may_build_another_network():
-    env = make_vec_env(environment, 2, seed=0)
+    env = two_environments()
     model = REINFORCE(OwnNetwork, env, n_steps=16, seed=0, device="cpu").learn(64)
     assert type(model.policy.mlp_extractor.extractor) is MlpExtractor
     evaluate_policy(model, env, n_eval_episodes=4, warn=False)

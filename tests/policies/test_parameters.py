@@ -50,15 +50,6 @@ def test_read_and_write_are_an_exact_round_trip() -> None:
     assert all(th.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
-def test_split_is_the_inverse_of_read() -> None:
-    actor = parameters.actor_parameters(make(ActorCriticPolicy))
-    thetas = th.randn(3, len(parameters.read(actor)), generator=th.Generator().manual_seed(0)).float().double()
-    parts = parameters.split(thetas, actor)
-    assert [part.shape for part in parts] == [(3, *p.shape) for p in actor]
-    for i, theta in enumerate(thetas):
-        assert th.equal(parameters.read([part[i] for part in parts]), theta)
-
-
 def test_an_actor_without_trainable_parameters_is_an_error() -> None:
     policy = make(LinearPolicy)
     policy.action_net.requires_grad_(False)

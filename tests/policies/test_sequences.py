@@ -8,7 +8,7 @@ import torch as th
 from recurrent_models import EXACT, SPACES, by_steps, make_recurrent
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.common.tensors import flatten, take
+from sb3_reinforce.common.tensors import flatten, map_parts, stack, take
 from sb3_reinforce.policies import sequences
 from sb3_reinforce.policies.sequences import episode_numbers, rows_of, sequence_minibatches
 
@@ -27,10 +27,8 @@ NETWORKS = [
 
 def observations(space):
     space.seed(0)
-    samples = [space.sample() for _ in range(DONES.size)]
-    if isinstance(samples[0], dict):
-        return {key: np.stack([s[key] for s in samples]).reshape(*DONES.shape, -1) for key in samples[0]}
-    return np.stack(samples).reshape(*DONES.shape, *space.shape)
+    samples = stack([space.sample() for _ in range(DONES.size)])
+    return map_parts(lambda part: part.reshape(*DONES.shape, *part.shape[1:]), samples)
 
 
 def policy_and_rows(name, network, carried):
