@@ -7,16 +7,12 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
+from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import (
-    ActorCriticCnnPolicy,
-    ActorCriticPolicy,
-    BasePolicy,
-    MultiInputActorCriticPolicy,
-)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
@@ -51,7 +47,7 @@ from sb3_reinforce.policies.evaluation import (
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
-from sb3_reinforce.sampling.collection import Extent, by_step, check_rollout_data, collect, warn_of_own_methods
+from sb3_reinforce.sampling.collection import Extent, check_rollout_data, collect, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
@@ -138,9 +134,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": ActorCriticPolicy,
-        "CnnPolicy": ActorCriticCnnPolicy,
-        "MultiInputPolicy": MultiInputActorCriticPolicy,
+        **A2C.policy_aliases,
         "MaskedPolicy": MaskedPolicy,
     }
     _arguments = REINFORCE_ARGUMENTS
@@ -405,10 +399,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             those before that step, or before the critic's passes
         """
         rollout = cast(Rollout, self.rollout)
-        advantages, returns = by_step(self.rollout_buffer)
         ent_coef = self._scheduled("ent_coef")
         critic_rate = self._critic_rate()
-        batch = training_batch(rollout, advantages, returns, self.normalize_advantage)
+        batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)
         route = route_of(self.policy, with_critic=rollout.values is not None)
         actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)

@@ -22,10 +22,10 @@ from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.weights import by_step
 from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
 
 # By check: the largest error that passes, and what the error compares

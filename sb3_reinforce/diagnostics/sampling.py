@@ -14,9 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_integer, check_kind
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.weights import compute_weights
+from sb3_reinforce.estimation.weights import by_step, compute_weights
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.collection import by_step
 from sb3_reinforce.sampling.measurement import undisturbed
 
 

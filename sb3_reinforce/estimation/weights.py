@@ -121,8 +121,16 @@ class Batch:
     values: th.Tensor | None
 
 
-def training_batch(rollout: Rollout, advantages: Floats, returns: Floats, normalize: bool) -> Batch:
+def by_step(buffer: RolloutBuffer) -> tuple[Floats, Floats]:
+    """``advantages`` and ``returns`` as ``(n_steps, n_envs)``, also after ``get`` has flattened them env by env."""
+    if not buffer.generator_ready:
+        return buffer.advantages, buffer.returns
+    return buffer.advantages.reshape(buffer.n_envs, -1).T.copy(), buffer.returns.reshape(buffer.n_envs, -1).T.copy()
+
+
+def training_batch(rollout: Rollout, buffer: RolloutBuffer, normalize: bool) -> Batch:
     """The used steps of a rollout, with the advantages and returns of the buffer, which a callback may have changed."""
+    advantages, returns = by_step(buffer)
     used = rollout.used
     return Batch(
         observations=select(rollout.inputs, used),

@@ -14,7 +14,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
-from sb3_reinforce.common.tensors import take
+from sb3_reinforce.common.tensors import map_parts, take
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.policies.evaluation import Route, route_of
 from sb3_reinforce.sampling.actors import Actor
@@ -173,23 +173,12 @@ def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None
 def resize(buffer: RolloutBuffer, n_steps: int) -> None:
     """Cut a rollout buffer to ``n_steps`` rows, or double it to that number."""
 
-    def resized(rows: Any) -> Any:
-        if isinstance(rows, dict):
-            return {key: resized(part) for key, part in rows.items()}
-        if n_steps <= len(rows):
-            return rows[:n_steps]
-        return np.concatenate([rows, np.zeros_like(rows)])
+    def resized(rows: np.ndarray) -> np.ndarray:
+        return rows[:n_steps] if n_steps <= len(rows) else np.concatenate([rows, np.zeros_like(rows)])
 
     for name in ROWS:
-        setattr(buffer, name, resized(getattr(buffer, name)))
+        setattr(buffer, name, map_parts(resized, getattr(buffer, name)))
     buffer.buffer_size = n_steps
-
-
-def by_step(buffer: RolloutBuffer) -> tuple[np.ndarray, np.ndarray]:
-    """``advantages`` and ``returns`` as ``(n_steps, n_envs)``, also after ``get`` has flattened them env by env."""
-    if not buffer.generator_ready:
-        return buffer.advantages, buffer.returns
-    return buffer.advantages.reshape(buffer.n_envs, -1).T.copy(), buffer.returns.reshape(buffer.n_envs, -1).T.copy()
 
 
 def warn_of_own_methods(buffer: RolloutBuffer) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_reinforce.common.tensors import take
+from sb3_reinforce.common.tensors import map_parts, take
 from sb3_reinforce.estimation.returns import Integers
 from sb3_reinforce.sampling.collection import ROWS, Bools, TerminalObs
 
@@ -71,9 +71,9 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
 
 def side_by_side(arrays: Sequence[Any], n_steps: int, mode: Any = "constant") -> Any:
     """Arrays, or dicts of arrays, along the axis of the environments, cut or padded to ``n_steps`` rows."""
-    if isinstance(arrays[0], dict):
-        return {key: side_by_side([part[key] for part in arrays], n_steps, mode) for key in arrays[0]}
-    columns = [rows[:n_steps] for rows in arrays]
-    return np.concatenate(
-        [np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)], mode) for rows in columns], axis=1
-    )
+
+    def padded(rows: np.ndarray) -> np.ndarray:
+        rows = rows[:n_steps]
+        return np.pad(rows, [(0, n_steps - len(rows)), *[(0, 0)] * (rows.ndim - 1)], mode)
+
+    return map_parts(lambda *parts: np.concatenate([padded(rows) for rows in parts], axis=1), *arrays)
