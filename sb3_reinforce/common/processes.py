@@ -77,7 +77,7 @@ class Processes:
 
     def connect(self) -> None:
         """Connect process 0 with each other process, which proves by a key that it belongs to the group."""
-        # Nobody waits for a connection before all have called learn()
+        # The port is open only while the processes connect
         dist.barrier()
         invitation: list[Any] = [None]
         if self.rank > 0:

@@ -26,9 +26,13 @@ from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperat
 class Diagnosis(BaseCallback):
     """Keeps what it knows of a model from one ``learn()`` to the next, but not for another model."""
 
-    # A REINFORCE, or for some a FiniteDifference
+    # A REINFORCE; GradientQualityCallback takes a FiniteDifference too
     model: Any
-    last_model: Any = None
+
+    def __init__(self, verbose: int = 0):
+        super().__init__(verbose)
+        self.last_model: Any = None
+        self.forget()
 
     def _init_callback(self) -> None:
         if self.model is not self.last_model:

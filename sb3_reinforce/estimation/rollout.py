@@ -90,7 +90,7 @@ class Running:
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
     def unless(self, starts: Bools) -> "Running":
-        """The episodes that go on where none ``starts``; the environments may be more or fewer than before."""
+        """The episodes that go on where none ``starts``; environments that were not there before must start."""
         timesteps = np.resize(self.timesteps, len(starts))
         rewards = np.resize(self.rewards, len(starts))
         return Running(np.where(starts, 0, timesteps), np.where(starts, 0.0, rewards))

@@ -136,6 +136,7 @@ def collect(
                     # Some VecEnvs write the next terminal observation into the same array
                     terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
         if is_attached and not actor.is_current(model.policy):
+            # Other actors have returned log π with the actions
             if log_probs is None:
                 write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy

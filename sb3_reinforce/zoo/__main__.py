@@ -109,7 +109,8 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
     if given.env not in gym.registry:
         near = difflib.get_close_matches(given.env, gym.registry, n=1)
         hint = f": did you mean {near[0]}?" if near else ""
-        parser.error(f"--env {given.env} is not registered (one of another package needs --gym-packages PACKAGE){hint}")
+        other = "an environment of another package needs --gym-packages PACKAGE"
+        parser.error(f"--env {given.env} is not registered ({other}){hint}")
     for option, env_kwargs in (("--env-kwargs", given.env_kwargs), ("--eval-env-kwargs", given.eval_env_kwargs)):
         try:
             if env_kwargs:

@@ -41,6 +41,7 @@ def fall(env, timesteps, change=None, n_envs=1, **kwargs):
         with th.no_grad():
             change(model.policy)
     callback = PitfallCallback()
+    assert callback.found == {}, "also where it is never used, as in the other processes under torchrun"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model.learn(timesteps, callback)
