@@ -9,7 +9,7 @@ two searches are run only on tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
-``cpu_seconds`` the same by the process's own clock, which a busy machine does not stretch. The rows of a run are
+``cpu_seconds`` the same by the clock of the process, which a busy machine stretches less. The rows of a run are
 written when it is finished, and a run that is there is not repeated: stop the script when you like and start it again.
 
 Under ``python -m torch.distributed.run --standalone --nproc-per-node W`` our runs collect in W processes, one run after

@@ -10,6 +10,7 @@ algorithms that were run on every task.
 """
 
 import argparse
+from collections.abc import Collection
 from pathlib import Path
 
 import matplotlib
@@ -80,14 +81,14 @@ def draw_curves(results: pd.DataFrame, clock: str) -> None:
     # An algorithm need not have been run on the first task
     lines = {line.get_label(): line for axis in pairs[:, 0] for line in axis.get_lines()}
     legend = {"loc": "outside upper center", "ncols": len(lines), "frameon": False}
-    title = f"interquartile mean of {seeds_of(results)}, bands: 95 % bootstrap intervals"
+    counts = results.groupby(["task", "algorithm"])["seed"].nunique()
+    title = f"interquartile mean of {seeds(counts)}, bands: 95 % bootstrap intervals"
     figure.legend(handles=list(lines.values()), title=title, **legend)
 
 
-def seeds_of(results: pd.DataFrame) -> str:
-    """How many seeds the runs of a task and an algorithm have."""
-    counts = results.groupby(["task", "algorithm"])["seed"].nunique()
-    return f"{counts.min()} seeds" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()} seeds"
+def seeds(counts: Collection[int]) -> str:
+    """The least and the greatest number of seeds, for a title."""
+    return f"{min(counts)} seeds" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)} seeds"
 
 
 def color(algorithm: str) -> str:
@@ -112,8 +113,9 @@ def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:
 
 def draw_summary(scores: dict[str, np.ndarray]) -> None:
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
-    n_runs, n_tasks = next(iter(scores.values())).shape
-    figure.suptitle(f"{n_tasks} tasks, {n_runs} seeds; bars and bands are 95 % bootstrap intervals", fontsize="medium")
+    n_tasks = next(iter(scores.values())).shape[1]
+    counts = [len(score) for score in scores.values()]
+    figure.suptitle(f"{n_tasks} tasks, {seeds(counts)}; bars and bands are 95 % bootstrap intervals", fontsize="medium")
     means, intervals = library.get_interval_estimates(scores, metrics.aggregate_iqm, reps=REPETITIONS)
     draw_intervals(left, means, intervals)
     left.set(title="All tasks together", xlabel="interquartile mean of the return\n(0: random, 1: published PPO)")
