@@ -45,7 +45,7 @@ def spread(values: pd.Series, digits: int = 1) -> str:
 
 
 def counted(values: pd.Series) -> str:
-    """The same with the number of seeds."""
+    """The median, the least and greatest, and the number of seeds."""
     return NONE if values.empty else f"{spread(values)} [{len(values)}]"
 
 
@@ -78,11 +78,11 @@ def comparison() -> str:
         returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", "a2c", "ppo")}
         if len(returns["reinforce"]):
             lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task)])
-    return markdown(["task (steps)", "REINFORCE", "A2C", "PPO", "the Zoo's own, one run each"], lines)
+    return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "the Zoo's own, one run each [steps]"], lines)
 
 
 def natural() -> str:
-    """The natural step with one setting beside the optimizer's step with each task's, and what the Zoo says of TRPO."""
+    """The natural step beside the optimizer's step, and what the Zoo publishes of TRPO."""
     trpo = read("published").query("algorithm == 'trpo'").set_index("task")
     lines = []
     for task, budget, runs in by_task(read("natural")):
@@ -123,7 +123,7 @@ def readme() -> str:
         same = rows[rows["task"] == task]
         cells = [counted(same[same["algorithm"] == name]["return"]) for name in ("reinforce", "a2c", "ppo")]
         lines.append([f"{task} ({short(same['budget'].iloc[0])})", *cells])
-    return markdown(["task (steps)", "REINFORCE", "A2C", "PPO"], lines)
+    return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO"], lines)
 
 
 def memory() -> str:
