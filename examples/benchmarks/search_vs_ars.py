@@ -98,7 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="Pendulum-v1", choices=list(ZOO))
     parser.add_argument("--algo", nargs="+", default=["FiniteDifference", "ARS"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[20, 21, 22, 23, 24])
     parser.add_argument("--timesteps", type=int)
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
