@@ -9,6 +9,7 @@ sys.path.insert(0, str(HERE / "_ext"))
 
 import lesson  # noqa: E402
 import tables  # noqa: E402
+import tuning  # noqa: E402
 
 import sb3_reinforce  # noqa: E402
 
@@ -28,7 +29,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "substitution"]
 html_math_renderer = "mathml"
 myst_heading_anchors = 3
 # Written from the committed CSVs: no number of a result stands in a page
-myst_substitutions = tables.all_tables()
+myst_substitutions = tables.all_tables() | {"tuning": tuning.table()}
 
 # The lesson's pages are examples/*.py. A page is executed again only when its code has changed
 lesson.copy_pages(HERE.parent / "examples", HERE / "lesson")

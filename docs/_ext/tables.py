@@ -46,7 +46,9 @@ def spread(values: pd.Series, digits: int = 1) -> str:
 
 def counted(values: pd.Series) -> str:
     """The median, the least and greatest, and the number of seeds."""
-    return NONE if values.empty else f"{spread(values)} [{len(values)}]"
+    if values.empty:
+        return NONE
+    return f"{spread(values) if len(values) > 1 else number(values.item())} [{len(values)}]"
 
 
 def by_task(rows: pd.DataFrame) -> Iterator[tuple[str, int, pd.DataFrame]]:
@@ -71,14 +73,15 @@ def final(*names: str) -> pd.DataFrame:
 
 
 def comparison() -> str:
-    """REINFORCE, A2C and PPO on every task that REINFORCE was run on."""
+    """REINFORCE and its peers on every task that REINFORCE was run on."""
     rows = final("comparison", "comparison_others")
     lines = []
     for task, budget, runs in by_task(rows):
-        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", "a2c", "ppo")}
+        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", "a2c", "ppo", "trpo")}
         if len(returns["reinforce"]):
             lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task)])
-    return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "the Zoo's own, one run each [steps]"], lines)
+    header = ["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO", "the Zoo's own, one run each [steps]"]
+    return markdown(header, lines)
 
 
 def natural() -> str:
