@@ -1,32 +1,42 @@
 """The table of the runs behind the shipped settings."""
 
+import inspect
+
 import yaml
-from tables import RESULTS, counted, markdown, read, short
+from tables import RESULTS, counted, final, markdown, read, short
+
+from sb3_reinforce import REINFORCE
 
 SETTINGS = RESULTS.parents[2] / "sb3_reinforce" / "zoo" / "hyperparams" / "reinforce.yml"
+DEFAULTS = {name: str(each.default) for name, each in inspect.signature(REINFORCE).parameters.items()}
+DEFAULTS |= {"policy": "MlpPolicy", "normalize": "False"}
 
 
 def shipped(task: str) -> dict[str, str]:
     """The shipped settings of a task, written as in ``tuning.csv``."""
     settings = yaml.safe_load(SETTINGS.read_text())[task]
-    return {key: str(value).replace(" ", "") for key, value in settings.items() if key not in ("n_timesteps", "policy")}
+    return DEFAULTS | {key: str(value).replace(" ", "") for key, value in settings.items()}
 
 
-def changes(task: str, text: str) -> list[str]:
+def changes(task: str, text: str) -> str:
     """What a line of settings changes in the shipped ones."""
     ours = shipped(task)
-    theirs = dict(each.split("=", 1) for each in text.split())
-    changed = [f"`{key}={value}`" for key, value in theirs.items() if ours.get(key) != value]
-    return changed + [f"no `{key}`" for key in ours if key not in theirs]
+    theirs = DEFAULTS | dict(each.split("=", 1) for each in text.split())
+    if theirs["step"] == "optimizer":
+        # It has no use for a target
+        del theirs["target_kl"]
+    return ", ".join(f"`{key}={value}`" for key, value in theirs.items() if ours[key] != value)
 
 
 def table() -> str:
     """The returns of each variant, by task, on the seeds of the choice and on the reported ones."""
     rows = read("tuning").query("algorithm == 'reinforce'")
+    reported = final("comparison", "comparison_others").query("algorithm == 'reinforce'")
     lines = []
     for (task, budget, text), runs in rows.groupby(["task", "budget", "settings"], sort=False):
-        is_reported = runs["seed"] < 100
-        cells = [counted(runs["return"][chosen]) for chosen in (~is_reported, is_reported)]
-        lines.append([f"{task} ({short(int(budget))})", ", ".join(changes(str(task), text)) or "as shipped", *cells])
+        variant = changes(str(task), text)
+        shown = runs[runs["seed"] < 100] if variant else reported.query("task == @task and budget == @budget")
+        cells = [counted(each["return"]) for each in (runs[runs["seed"] >= 100], shown)]
+        lines.append([f"{task} ({short(int(budget))})", variant or "as shipped", *cells])
     lines.sort(key=lambda line: (line[0], line[1] != "as shipped"))
     return markdown(["task (steps)", "changes to the shipped settings", "seeds from 100 on", "reported seeds"], lines)
