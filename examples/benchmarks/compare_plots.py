@@ -43,9 +43,10 @@ REFERENCES = {
     "Walker2d-v5": (1.8, 3479.0),
     "Swimmer-v5": (0.8, 282.0),
     "Ant-v5": (-48.0, 1327.0),
-    # Which benchmark.md does not have: PPO at 1M steps in Tianshou's examples/mujoco/README.md, on version 2
+    # Which benchmark.md does not have: PPO at 1M steps in Tianshou's examples/mujoco/README.md, on versions 2 and 3
     "InvertedPendulum-v5": (5.2, 1000.0),
     "Reacher-v5": (-43.3, -4.1),
+    "Humanoid-v5": (112.6, 787.1),
 }
 
 
