@@ -26,6 +26,7 @@ BUDGETS = {
     "enjoy": "--no-render -n 50",
     "images.py": "--n-envs 1 --timesteps 32 --rounds 1",
     "masks.py": "--seeds 0 --evaluate-at 256",
+    "noise_scale.py": "--tasks CartPole-v1 --seeds 0 --timesteps 200 --output rows.csv",
     "peers.py": "--contenders REINFORCE --seeds 0 --timesteps 600",
     "record_video": "-n 20",
     "scaling.py": "--n-envs 64 --timesteps 64 --rounds 1",

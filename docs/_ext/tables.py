@@ -198,6 +198,19 @@ def common_random_numbers() -> str:
     return markdown(["environment", "estimators", "variance without / with", "steps with / without"], lines)
 
 
+def noise_scale() -> str:
+    """The returns with each fixed number of episodes, and with the noise scale as the number."""
+    rows = read("noise_scale")
+    sizes = list(rows["n_episodes"].unique())
+    lines = []
+    for task, budget, runs in by_task(rows):
+        cells = [spread(runs.loc[runs["n_episodes"] == size, "return"], 0) for size in sizes]
+        chosen = runs.loc[runs["n_episodes"] == "noise_scale", "mean_episodes"].median()
+        lines.append([f"{task} ({short(budget)})", *cells, f"{chosen:.0f}"])
+    header = [size.replace("_", " ") for size in sizes]
+    return markdown(["task (steps)", *header, "mean size of its rollouts"], lines)
+
+
 def search_throughput() -> str:
     """Gradients a second beside ARS."""
     lines = [
@@ -261,6 +274,6 @@ def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
         comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
-        common_random_numbers, search_throughput, throughput, images, peers, processes, processes_model,
+        common_random_numbers, noise_scale, search_throughput, throughput, images, peers, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}
