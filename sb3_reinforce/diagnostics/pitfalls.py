@@ -207,9 +207,9 @@ PITFALLS: dict[str, Pitfall] = {
     "cut_episodes": cut_episodes,
 }
 
-# A pitfall that one of these explains is not reported after it
+# A pitfall that one of these explains is not reported after it. The rate of the policy is by default the critic's too
 CAUSES = {
     "deterministic_too_early": {"rate_too_large"},
     "too_few_episodes": {"rate_too_large", "deterministic_too_early"},
-    "useless_critic": {"unscaled_returns"},
+    "useless_critic": {"rate_too_large", "unscaled_returns"},
 }
