@@ -91,7 +91,7 @@ def make(run: Run, params: dict[str, Any] | None = None) -> tuple[BaseAlgorithm,
         settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
         kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
         env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
-        # The same starts for all algorithms, other than in training
+        # The same for all algorithms, other than in training
         manager.seed = 10_000 + run.seed
         eval_env = manager.create_envs(EVALUATION_EPISODES, eval_env=True)
     return rl_zoo3.ALGOS[run.algorithm](env=env, seed=run.seed, device="cpu", **kwargs), env, eval_env
