@@ -104,13 +104,7 @@ def collect(
         if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
         actions, values, log_probs = actor.act(model._last_obs)
-        write_row(rollout_buffer.observations, n_steps, model._last_obs)
-        write_row(rollout_buffer.actions, n_steps, actions)
-        if values is not None:
-            write_row(rollout_buffer.values, n_steps, values)
-        if log_probs is not None:
-            write_row(rollout_buffer.log_probs, n_steps, log_probs)
-
+        write_step(rollout_buffer, n_steps, model._last_obs, actions, values, log_probs)
         if model.use_sde:
             # Its standard deviation may overflow, and the environment would be blamed
             check_finite("The action", actions, (None,))
@@ -131,10 +125,7 @@ def collect(
         if np.count_nonzero(dones):
             counted = extent.count(starts[-1], n_steps)
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
-            for i in counted:
-                if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    # Some VecEnvs write the next terminal observation into the same array
-                    terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
+            terminal_obs.update({(n_steps - 1, i): obs for i, obs in at_time_limits(infos, counted).items()})
         if is_attached and not actor.is_current(model.policy):
             # Other actors have returned log π with the actions
             if log_probs is None:
@@ -151,6 +142,28 @@ def collect(
     if is_attached and log_probs is None:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, route
+
+
+def write_step(
+    buffer: RolloutBuffer, step: int, obs: Any, actions: Any, values: np.ndarray | None, log_probs: np.ndarray | None
+) -> None:
+    """Write what is known before the environments step."""
+    write_row(buffer.observations, step, obs)
+    write_row(buffer.actions, step, actions)
+    if values is not None:
+        write_row(buffer.values, step, values)
+    if log_probs is not None:
+        write_row(buffer.log_probs, step, log_probs)
+
+
+def at_time_limits(infos: list[dict[str, Any]], counted: list[int]) -> dict[int, Any]:
+    """The terminal observations of the environments whose episode a time limit ended."""
+    return {
+        # Some VecEnvs write the next terminal observation into the same array
+        i: deepcopy(infos[i]["terminal_observation"])
+        for i in counted
+        if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None
+    }
 
 
 def write_row(rows: Any, step: int, values: Any) -> None:
