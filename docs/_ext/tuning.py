@@ -3,7 +3,8 @@
 import inspect
 
 import yaml
-from tables import RESULTS, counted, final, markdown, read, short
+from cells import RESULTS, counted, markdown, read, short
+from tables import final
 
 from sb3_reinforce import REINFORCE
 
