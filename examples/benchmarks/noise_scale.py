@@ -71,7 +71,8 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    with open(arguments.output, "w", newline="") as file:
+    # An older file is not overwritten
+    with open(arguments.output, "x", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["task", "budget", "seed", "n_episodes", "mean_episodes", "return"])
         for seed, task, size in itertools.product(arguments.seeds, arguments.tasks, (*SIZES, None)):
