@@ -1,4 +1,4 @@
-"""What all tables are made from: the CSVs in ``examples/benchmarks/results``, and how numbers are written."""
+"""The rows of ``examples/benchmarks/results``, and how numbers are written in tables."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path

@@ -67,11 +67,11 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(BUDGETS), choices=list(BUDGETS))
     parser.add_argument("--seeds", nargs="+", type=int, required=True)
     parser.add_argument("--timesteps", type=int, help="steps per run; the default depends on the task")
-    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--output", type=Path, required=True, help="a new CSV")
     arguments = parser.parse_args()
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    # An older file is not overwritten
+    # Its runs take hours: an older file is kept
     with open(arguments.output, "x", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["task", "budget", "seed", "n_episodes", "mean_episodes", "return"])

@@ -125,7 +125,8 @@ def collect(
         if np.count_nonzero(dones):
             counted = extent.count(starts[-1], n_steps)
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
-            terminal_obs.update({(n_steps - 1, i): obs for i, obs in at_time_limits(infos, counted).items()})
+            for i, obs in at_time_limits(infos, counted).items():
+                terminal_obs[n_steps - 1, i] = obs
         if is_attached and not actor.is_current(model.policy):
             # Other actors have returned log π with the actions
             if log_probs is None:
