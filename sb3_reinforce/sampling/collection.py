@@ -125,8 +125,10 @@ def collect(
         if np.count_nonzero(dones):
             counted = extent.count(starts[-1], n_steps)
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
-            for i, obs in at_time_limits(infos, counted).items():
-                terminal_obs[n_steps - 1, i] = obs
+            for i in counted:
+                if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
+                    # Some VecEnvs write the next terminal observation into the same array
+                    terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
         if is_attached and not actor.is_current(model.policy):
             # Other actors have returned log π with the actions
             if log_probs is None:
@@ -155,16 +157,6 @@ def write_step(
         write_row(buffer.values, step, values)
     if log_probs is not None:
         write_row(buffer.log_probs, step, log_probs)
-
-
-def at_time_limits(infos: list[dict[str, Any]], counted: list[int]) -> dict[int, Any]:
-    """The terminal observations of the environments whose episode a time limit ended."""
-    return {
-        # Some VecEnvs write the next terminal observation into the same array
-        i: deepcopy(infos[i]["terminal_observation"])
-        for i in counted
-        if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None
-    }
 
 
 def write_row(rows: Any, step: int, values: Any) -> None:
