@@ -27,7 +27,7 @@ examples:
 	ls examples/*.py | xargs -t -n 1 -P 2 env MPLBACKEND=agg python
 
 # Agents for five tasks, with a model card each: python -m sb3_reinforce.zoo enjoy --algo reinforce --env Pendulum-v1 -f agents
-TASKS = MountainCar-v0:300000 Pendulum-v1:200000 Acrobot-v1:100000 MountainCarContinuous-v0:20000 CartPole-v1:50000
+TASKS = MountainCar-v0:300000 Pendulum-v1:100000 Acrobot-v1:100000 MountainCarContinuous-v0:20000 CartPole-v1:50000
 agents:
 	printf '%s\n' $(TASKS) | xargs -P 2 -I {} env OMP_NUM_THREADS=1 sh -c 'task={}; \
 	python -m sb3_reinforce.zoo train --algo reinforce --env $${task%:*} -n $${task#*:} -f agents --eval-freq -1 --seed 0 && \

@@ -4,8 +4,9 @@ Can the noise scale of the gradient choose the number of episodes in a rollout?
 The noise scale tr Σ / ‖E g‖² (McCandlish et al. 2018, arXiv:1812.06162) is the number of episodes with a
 signal-to-noise ratio of 1. Here a callback sets ``n_episodes`` to the median of the last ten estimates, rounded to a
 multiple of the environments and cut to the range of the fixed sizes. It starts with the second of them. All get the
-settings of ``sb3_reinforce.zoo`` with whole episodes instead of ``n_steps``, and train until a rollout reaches the
-number of steps. A row of the CSV is the return of 100 deterministic episodes after one training.
+settings of ``sb3_reinforce.zoo`` with whole episodes instead of ``n_steps``, without gSDE, whose noise episodes
+share, and train until a rollout reaches the number of steps. A row of the CSV is the return of 100 deterministic
+episodes after one training.
 
     python examples/benchmarks/noise_scale.py --seeds 100 101 102 103 104 105 --output noise_scale.csv
 """
@@ -54,7 +55,7 @@ class NoiseScaleEpisodes(GradientQualityCallback):
 
 def train(run: Run, size: int | None) -> tuple[float, float]:
     """The final return with rollouts of ``size`` episodes, or with the callback, and the mean number of episodes."""
-    model, env, eval_env = make(run, {"n_steps": None, "n_episodes": size or SIZES[1]})
+    model, env, eval_env = make(run, {"n_steps": None, "n_episodes": size or SIZES[1], "use_sde": False})
     callback = NoiseScaleEpisodes(SIZES[0], SIZES[-1])
     model.learn(run.budget, None if size else callback, log_interval=None)
     sync_envs_normalization(env, eval_env)
