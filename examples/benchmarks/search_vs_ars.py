@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_reinforce import FiniteDifference
 
 RESULTS = Path(__file__).parent / "results" / "search_vs_ars.csv"
-# rl_zoo3 2.9.2, hyperparams/ars.yml; Swimmer-v5 has the entry of Swimmer-v4
+# rl_zoo3 2.9.2, hyperparams/ars.yml; Swimmer-v5 and HalfCheetah-v5 have the entries of version 4
 ZOO_MLP = dict(
     policy="MlpPolicy", learning_rate=0.018, n_delta=4, n_top=1, delta_std=0.1, zero_policy=False,
     policy_kwargs=dict(net_arch=[16]),
@@ -34,6 +34,7 @@ ZOO: dict[str, dict[str, Any]] = {
     "Pendulum-v1": ZOO_MLP,
     "MountainCarContinuous-v0": {**ZOO_MLP, "delta_std": 0.2},
     "Swimmer-v5": dict(policy="LinearPolicy", learning_rate=0.02, delta_std=0.01, n_delta=1, n_top=1),
+    "HalfCheetah-v5": dict(policy="LinearPolicy", learning_rate=0.02, delta_std=0.03, n_delta=32, n_top=4),
 }
 MLP = dict(
     policy="MlpPolicy", learning_rate=0.02, estimator="central", n_delta=4, delta_std=0.1,
@@ -46,13 +47,15 @@ OURS: dict[str, dict[str, Any]] = {
         **MLP, "n_top": 1, "delta_std": 0.2, "policy_kwargs": dict(net_arch=dict(pi=[16], vf=[])),
     },
     "Swimmer-v5": dict(policy="LinearPolicy", learning_rate=0.02, estimator="central", n_delta=2, delta_std=0.05),
+    "HalfCheetah-v5": dict(policy="LinearPolicy", learning_rate=0.02, estimator="central", n_delta=8, delta_std=0.03),
 }  # fmt: skip
 # As many as there are candidates, so that none idles, but for CartPole, whose episodes differ most in length
-N_ENVS = {"CartPole-v1": 1, "Pendulum-v1": 8, "MountainCarContinuous-v0": 8, "Swimmer-v5": 4}
-NORMALIZE = {"Pendulum-v1", "MountainCarContinuous-v0"}
-# The Zoo's, but for Swimmer, which takes 2 million steps there
+N_ENVS = {"CartPole-v1": 1, "Pendulum-v1": 8, "MountainCarContinuous-v0": 8, "Swimmer-v5": 4, "HalfCheetah-v5": 16}
+NORMALIZE = {"Pendulum-v1", "MountainCarContinuous-v0", "HalfCheetah-v5"}
+# The Zoo's, but for Swimmer and HalfCheetah, which take 2 and 12.5 million steps there
 TIMESTEPS = {
     "CartPole-v1": 50_000, "Pendulum-v1": 2_000_000, "MountainCarContinuous-v0": 500_000, "Swimmer-v5": 300_000,
+    "HalfCheetah-v5": 2_000_000,
 }  # fmt: skip
 
 
