@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
 RESULTS = Path(__file__).parent / "results" / "search_vs_ars.csv"
 # As they are called in the results, and in rl_zoo3.ALGOS
@@ -28,12 +28,12 @@ NAMES = {"FiniteDifference": "finite_difference", "ARS": "ars"}
 class LastWithin(BaseCallback):
     """Remembers the last policy that was found within the budget; an update may begin within it and end beyond."""
 
-    def __init__(self, env: VecEnv, timesteps: int):
+    def __init__(self, timesteps: int):
         super().__init__()
-        self.env, self.timesteps = env, timesteps
+        self.timesteps = timesteps
 
     def _on_rollout_start(self) -> None:
-        steps = sum(self.env.get_attr("total_steps"))
+        steps = sum(self.training_env.get_attr("total_steps"))
         if steps <= self.timesteps:
             self.policy = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
             self.steps = steps
@@ -43,11 +43,11 @@ class LastWithin(BaseCallback):
 
 
 def mean_return(model: BaseAlgorithm, env_id: str) -> float:
-    """The mean return of 100 episodes, whose starts are the same for all models."""
+    """The mean return of 100 episodes in an environment with the same seed for all models."""
     env = make_vec_env(env_id, 1, seed=1000)
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        env = VecNormalize(env, training=False, norm_reward=False)
+        env = VecNormalize(env, training=False, norm_obs=normalization.norm_obs, norm_reward=False)
         sync_envs_normalization(normalization, env)
     return float(evaluate_policy(model, env, 100)[0])
 
@@ -57,18 +57,18 @@ def main() -> None:
     parser.add_argument("--env", default="Pendulum-v1")
     parser.add_argument("--algo", nargs="+", default=list(NAMES), choices=list(NAMES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[20, 21, 22, 23, 24])
-    parser.add_argument("--timesteps", type=int, help="the Zoo's for ARS by default")
+    parser.add_argument("--timesteps", type=int, help="by default as many as the Zoo gives ARS")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    for name in NAMES.values():
-        if settings_of(name, arguments.env) is None:
+    for name in {*arguments.algo, *([] if arguments.timesteps else ["ARS"])}:
+        if settings_of(NAMES[name], arguments.env) is None:
             parser.error(f"--env: {name} has no settings for {arguments.env}")
     th.set_num_threads(1)
     timesteps = arguments.timesteps or int(settings_of("ars", arguments.env)["n_timesteps"])
     for seed in arguments.seeds:
         for name in arguments.algo:
-            model, env, _ = make(Run(arguments.env, NAMES[name], seed, timesteps))
-            callback = LastWithin(env, timesteps)
+            model, _, _ = make(Run(arguments.env, NAMES[name], seed, timesteps))
+            callback = LastWithin(timesteps)
             model.learn(timesteps, callback, log_interval=None)
             after = mean_return(model, arguments.env)
             model.policy.load_state_dict(callback.policy)
