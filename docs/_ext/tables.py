@@ -7,10 +7,10 @@ from cells import LABELS, NONE, by_task, counted, markdown, number, read, short,
 README_TASKS = ("CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1", "Acrobot-v1", "LunarLander-v3")
 
 
-def published(task: str, sources: str = "RL Zoo") -> str:
-    """What others publish for a task, with their numbers of steps."""
+def published(task: str, *algorithms: str) -> str:
+    """What the Zoo publishes for a task, with its numbers of steps."""
     rows = read("published")
-    mine = rows[(rows["task"] == task) & rows["source"].str.startswith(sources)]
+    mine = rows[(rows["task"] == task) & rows["algorithm"].isin(algorithms) & rows["source"].str.startswith("RL Zoo")]
     texts = [f"{LABELS[row.algorithm]} {number(row['return'])} [{short(row.timesteps)}]" for _, row in mine.iterrows()]
     return ", ".join(texts) or NONE
 
@@ -24,11 +24,12 @@ def final(*names: str) -> pd.DataFrame:
 def comparison() -> str:
     """REINFORCE and its peers on every task that REINFORCE was run on."""
     rows = final("comparison", "comparison_others")
+    peers = ("a2c", "ppo", "trpo")
     lines = []
     for task, budget, runs in by_task(rows):
-        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", "a2c", "ppo", "trpo")}
+        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", *peers)}
         if len(returns["reinforce"]):
-            lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task)])
+            lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task, *peers)])
     header = ["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO", "the Zoo's own, one run each [steps]"]
     return markdown(header, lines)
 
@@ -89,7 +90,7 @@ def memory() -> str:
             theirs = [f"{spread(peer['return'])} [{short(peer['budget'].iloc[0])}]"]
             theirs.append(number(peer["cpu_seconds"].median(), 0))
         ours = [f"{spread(runs['return'])} [{short(budget)}]", number(runs["cpu_seconds"].median(), 0)]
-        lines.append([task, *ours, *theirs, published(task)])
+        lines.append([task, *ours, *theirs, published(task, "ppo_lstm")])
     return markdown(["task", "RecurrentREINFORCE", "seconds", "RecurrentPPO", "seconds", "the Zoo's own"], lines)
 
 
@@ -132,8 +133,8 @@ def search_vs_ars() -> str:
         for name in ("FiniteDifference", "ARS"):
             returns = runs[runs["algorithm"] == name].sort_values("seed")["mean_return"]
             cells.append(f"{number(returns.mean())} ({', '.join(number(value) for value in returns)})")
-        lines.append([f"{env} ({short(budget)})", *cells])
-    return markdown(["environment (steps)", "FiniteDifference: mean (each seed)", "ARS"], lines)
+        lines.append([f"{env} ({short(budget)})", *cells, published(env, "ars")])
+    return markdown(["environment (steps)", "FiniteDifference: mean (each seed)", "ARS", "the Zoo's own [steps]"], lines)
 
 
 def common_random_numbers() -> str:
