@@ -134,7 +134,8 @@ def search_vs_ars() -> str:
             returns = runs[runs["algorithm"] == name].sort_values("seed")["mean_return"]
             cells.append(f"{number(returns.mean())} ({', '.join(number(value) for value in returns)})")
         lines.append([f"{env} ({short(budget)})", *cells, published(env, "ars")])
-    return markdown(["environment (steps)", "FiniteDifference: mean (each seed)", "ARS", "the Zoo's own [steps]"], lines)
+    header = ["environment (steps)", "FiniteDifference: mean (each seed)", "ARS", "the Zoo's own [steps]"]
+    return markdown(header, lines)
 
 
 def common_random_numbers() -> str:
