@@ -24,12 +24,12 @@ def final(*names: str) -> pd.DataFrame:
 def comparison() -> str:
     """REINFORCE and its peers on every task that REINFORCE was run on."""
     rows = final("comparison", "comparison_others")
-    peers = ("a2c", "ppo", "trpo")
+    others = ("a2c", "ppo", "trpo")
     lines = []
     for task, budget, runs in by_task(rows):
-        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", *peers)}
+        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", *others)}
         if len(returns["reinforce"]):
-            lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task, *peers)])
+            lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task, *others)])
     header = ["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO", "the Zoo's own, one run each [steps]"]
     return markdown(header, lines)
 
@@ -126,7 +126,7 @@ def masks_speed() -> str:
 
 
 def search_vs_ars() -> str:
-    """Mean of the seeds, and each seed."""
+    """Mean of the seeds, and each seed, beside what the Zoo publishes of ARS."""
     lines = []
     for (env, budget), runs in read("search_vs_ars").groupby(["env", "budget"], sort=False):
         cells = []
