@@ -60,7 +60,10 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, help="by default as many as the Zoo gives ARS")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    for name in {*arguments.algo, *([] if arguments.timesteps else ["ARS"])}:
+    needed = set(arguments.algo)
+    if not arguments.timesteps:
+        needed.add("ARS")
+    for name in needed:
         if settings_of(NAMES[name], arguments.env) is None:
             parser.error(f"--env: {name} has no settings for {arguments.env}")
     th.set_num_threads(1)
