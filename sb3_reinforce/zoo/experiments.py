@@ -30,11 +30,12 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "finite_difference": FiniteDifference,
 }
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-# The keys that the Zoo reads itself, and the arguments that it passes itself
+# The keys that the Zoo reads itself, one of this package, and the arguments that the Zoo passes itself
 ZOO_KEYS = {
     "n_timesteps", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack", "env_kwargs",
     "monitor_kwargs",
 }  # fmt: skip
+TRAIN_ENV_KWARGS = "train_env_kwargs"
 ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
 # Settings whose dict may be given as a text
 PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
@@ -51,8 +52,8 @@ class Experiment(exp_manager.ExperimentManager):
 
     Without the keyword ``config`` the settings are read from ``HYPERPARAMS``, or from the model whose training
     continues. The default entry is fitted to the spaces of the environment. Trial 0 of a study counts as a trial. A
-    text ``lin_NUMBER`` becomes a schedule in every argument that may be one. A wrong setting raises a ``ValueError`` or
-    a ``TypeError`` that names it.
+    text ``lin_NUMBER`` becomes a schedule in every argument that may be one. ``train_env_kwargs`` are keyword arguments
+    of the training environments alone. A wrong setting raises a ``ValueError`` or a ``TypeError`` that names it.
 
     :param arguments: Positional arguments of ``ExperimentManager``
     :param kwargs: Keyword arguments of ``ExperimentManager``
@@ -96,10 +97,13 @@ class Experiment(exp_manager.ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)
-        for key in ("policy_kwargs", "env_kwargs"):
+        for key in ("policy_kwargs", "env_kwargs", TRAIN_ENV_KWARGS):
             self.argument_names |= as_dict(key, found.get(key)).keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
+        if TRAIN_ENV_KWARGS in found:
+            # The Zoo's commands read env_kwargs from the saved settings too, for the environments that they show
+            found["env_kwargs"] = {**found.get("env_kwargs", {}), **found.pop(TRAIN_ENV_KWARGS), **self.env_kwargs}
         return found, saved
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:  # type: ignore[override]
@@ -174,7 +178,7 @@ def arguments_of(algorithm: str) -> dict[str, inspect.Parameter]:
 
 def allowed_keys(algorithm: str) -> set[str]:
     """The keys that an algorithm's entry in a configuration may have."""
-    return arguments_of(algorithm).keys() - ZOO_ARGUMENTS | ZOO_KEYS
+    return arguments_of(algorithm).keys() - ZOO_ARGUMENTS | ZOO_KEYS | {TRAIN_ENV_KWARGS}
 
 
 def scheduled_keys(algorithm: str) -> set[str]:
@@ -200,7 +204,7 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
                 raise ConfigurationError(f"{key} is the text {value!r}, as YAML reads it: write !!float {value}")
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
-    for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs"):
+    for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", TRAIN_ENV_KWARGS):
         as_dict(key, hyperparams.get(key))
     if not isinstance(hyperparams.get("normalize"), bool):
         as_dict("normalize", hyperparams.get("normalize"))

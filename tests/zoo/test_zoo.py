@@ -183,6 +183,8 @@ SETTINGS = [
     ("normalize: nn.Norm", "but 'nn.Norm' raises AttributeError"),
     ("env_kwargs: 3", "env_kwargs must be a dict, got 3"),
     ("env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
+    ("train_env_kwargs: 3", "train_env_kwargs must be a dict, got 3"),
+    ("train_env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
     ("frame_stack: a", "frame_stack must be an integer, got 'a'"),
 ]
 

@@ -1,8 +1,10 @@
 """Which settings an algorithm gets in the Zoo: published, of a model, of a trial; and what they are turned into."""
 
+import re
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
 import rl_zoo3
@@ -106,6 +108,20 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path):
     train("reinforce", "-n", "64", "--eval-freq", "-1", "-f", str(tmp_path))
     train("reinforce", "-i", str(tmp_path / "reinforce" / RUN / "CartPole-v1.zip"), *arguments)
     assert load(tmp_path / "reinforce" / "CartPole-v1_2").gamma == 0.5
+
+
+@pytest.mark.parametrize(("arguments", "length"), [((), 5), (("--env-kwargs", "max_episode_steps:6"), 6)])
+def test_train_env_kwargs_are_for_training_only_and_the_command_line_goes_first(arguments, length, tmp_path, capsys):
+    entry = {"policy": "MlpPolicy", "n_timesteps": 64, "n_steps": 32, "train_env_kwargs": {"max_episode_steps": 5}}
+    options = conf(tmp_path, **{"CartPole-v1": entry})[:-2]
+    train("reinforce", *options, *arguments, "--eval-env-kwargs", "max_episode_steps:7", "--eval-freq", "32")
+    run = tmp_path / "reinforce" / RUN
+    # A pole does not fall within seven steps
+    assert {int(line.split(",")[1]) for line in (run / "0.monitor.csv").read_text().splitlines()[2:]} == {length}
+    assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
+    assert config_of(run) == entry
+    zoo("enjoy", "--algo", "reinforce", "--env", "CartPole-v1", "-f", str(tmp_path), "-n", "50", "--no-render")
+    assert min(map(int, re.findall(r"Episode Length (\d+)", capsys.readouterr().out))) > 5
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
