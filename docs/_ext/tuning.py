@@ -10,12 +10,13 @@ from sb3_reinforce import REINFORCE
 
 SETTINGS = RESULTS.parents[2] / "sb3_reinforce" / "zoo" / "hyperparams" / "reinforce.yml"
 DEFAULTS = {name: str(each.default) for name, each in inspect.signature(REINFORCE).parameters.items()}
-DEFAULTS |= {"policy": "MlpPolicy", "normalize": "False"}
+DEFAULTS |= {"policy": "MlpPolicy", "normalize": "False", "train_env_kwargs": "{}"}
 
 
 def shipped(task: str) -> dict[str, str]:
     """The shipped settings of a task, written as in ``tuning.csv``."""
-    settings = yaml.safe_load(SETTINGS.read_text())[task]
+    published = yaml.safe_load(SETTINGS.read_text())
+    settings = {**published[task], "train_env_kwargs": published["train_env_kwargs"].get(task, {})}
     return DEFAULTS | {key: str(value).replace(" ", "") for key, value in settings.items()}
 
 

@@ -30,13 +30,15 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "finite_difference": FiniteDifference,
 }
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-# The keys that the Zoo reads itself, one of this package, and the arguments that the Zoo passes itself
+# The keys that the Zoo reads itself, and the arguments that it passes itself
 ZOO_KEYS = {
     "n_timesteps", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack", "env_kwargs",
     "monitor_kwargs",
 }  # fmt: skip
-TRAIN_ENV_KWARGS = "train_env_kwargs"
 ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
+# In a configuration, a section by environment. The entries keep to the keys of the Zoo and the arguments of the algorithm,
+# so that other scripts can read them
+TRAIN_ENV_KWARGS = "train_env_kwargs"
 # Settings whose dict may be given as a text
 PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
 LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
@@ -136,6 +138,9 @@ def find_settings(experiment: Experiment) -> Settings:
     if key not in published:
         raise ConfigurationError(f"{config} must have an entry {env_id} or {fallback}")
     found = dict(as_dict(f"The entry {key} of {config}", published[key]))
+    train_env_kwargs = as_dict(TRAIN_ENV_KWARGS, published.get(TRAIN_ENV_KWARGS))
+    if env_id in train_env_kwargs:
+        found[TRAIN_ENV_KWARGS] = train_env_kwargs[env_id]
     return fit_default(found, experiment) if key == "default" else found
 
 

@@ -112,14 +112,15 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path):
 
 @pytest.mark.parametrize(("arguments", "length"), [((), 5), (("--env-kwargs", "max_episode_steps:6"), 6)])
 def test_train_env_kwargs_are_for_training_only_and_the_command_line_goes_first(arguments, length, tmp_path, capsys):
-    entry = {"policy": "MlpPolicy", "n_timesteps": 64, "n_steps": 32, "train_env_kwargs": {"max_episode_steps": 5}}
-    options = conf(tmp_path, **{"CartPole-v1": entry})[:-2]
+    entry = {"policy": "MlpPolicy", "n_timesteps": 64, "n_steps": 32}
+    limit = {"max_episode_steps": 5}
+    options = conf(tmp_path, **{"CartPole-v1": entry, "train_env_kwargs": {"CartPole-v1": limit}})[:-2]
     train("reinforce", *options, *arguments, "--eval-env-kwargs", "max_episode_steps:7", "--eval-freq", "32")
     run = tmp_path / "reinforce" / RUN
     # A pole does not fall within seven steps
     assert {int(line.split(",")[1]) for line in (run / "0.monitor.csv").read_text().splitlines()[2:]} == {length}
     assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
-    assert config_of(run) == entry
+    assert config_of(run) == entry | {"train_env_kwargs": limit}
     zoo("enjoy", "--algo", "reinforce", "--env", "CartPole-v1", "-f", str(tmp_path), "-n", "50", "--no-render")
     assert min(map(int, re.findall(r"Episode Length (\d+)", capsys.readouterr().out))) > 5
 
@@ -158,7 +159,7 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
 ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
 
 
-@pytest.mark.parametrize(("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default")])
+@pytest.mark.parametrize(("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default", "train_env_kwargs")])
 def test_every_entry_trains(name, env, tmp_path):
     try:
         rl_zoo3.utils.gym.make(env).close()
