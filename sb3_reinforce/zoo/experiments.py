@@ -36,8 +36,8 @@ ZOO_KEYS = {
     "monitor_kwargs",
 }  # fmt: skip
 ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
-# In a configuration, a section by environment. The entries keep to the keys of the Zoo and the arguments of the algorithm,
-# so that other scripts can read them
+# In a configuration, a section by environment: the entries keep to the keys of the Zoo and the arguments of the
+# algorithm, so that other scripts can read them
 TRAIN_ENV_KWARGS = "train_env_kwargs"
 # Settings whose dict may be given as a text
 PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
