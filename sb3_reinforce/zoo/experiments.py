@@ -99,13 +99,14 @@ class Experiment(exp_manager.ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)
-        for key in ("policy_kwargs", "env_kwargs", TRAIN_ENV_KWARGS):
-            self.argument_names |= as_dict(key, found.get(key)).keys()
+        keywords = {key: as_dict(key, found.get(key)) for key in ("policy_kwargs", "env_kwargs", TRAIN_ENV_KWARGS)}
+        for names in keywords.values():
+            self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
-        if TRAIN_ENV_KWARGS in found:
+        if found.pop(TRAIN_ENV_KWARGS, None):
             # The Zoo's commands read env_kwargs from the saved settings too, for the environments that they show
-            found["env_kwargs"] = {**found.get("env_kwargs", {}), **found.pop(TRAIN_ENV_KWARGS), **self.env_kwargs}
+            found["env_kwargs"] = {**keywords["env_kwargs"], **keywords[TRAIN_ENV_KWARGS], **self.env_kwargs}
         return found, saved
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:  # type: ignore[override]
@@ -140,7 +141,7 @@ def find_settings(experiment: Experiment) -> Settings:
     found = dict(as_dict(f"The entry {key} of {config}", published[key]))
     train_env_kwargs = as_dict(TRAIN_ENV_KWARGS, published.get(TRAIN_ENV_KWARGS))
     if env_id in train_env_kwargs:
-        found[TRAIN_ENV_KWARGS] = train_env_kwargs[env_id]
+        found.setdefault(TRAIN_ENV_KWARGS, train_env_kwargs[env_id])
     return fit_default(found, experiment) if key == "default" else found
 
 

@@ -110,19 +110,43 @@ def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path):
     assert load(tmp_path / "reinforce" / "CartPole-v1_2").gamma == 0.5
 
 
-@pytest.mark.parametrize(("arguments", "length"), [((), 5), (("--env-kwargs", "max_episode_steps:6"), 6)])
-def test_train_env_kwargs_are_for_training_only_and_the_command_line_goes_first(arguments, length, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("arguments", "length", "written"),
+    [
+        ((), 5, {}),
+        (("--env-kwargs", "max_episode_steps:6"), 6, {}),
+        (("-params", "train_env_kwargs:dict(max_episode_steps=6)"), 6, {"train_env_kwargs": {"max_episode_steps": 6}}),
+        (
+            ("-params", "env_kwargs:dict(max_episode_steps=6)", "train_env_kwargs:None"),
+            6,
+            {"env_kwargs": {"max_episode_steps": 6}, "train_env_kwargs": None},
+        ),
+    ],
+)
+def test_train_env_kwargs_are_for_training_only(arguments, length, written, tmp_path, capsys):
     entry = {"policy": "MlpPolicy", "n_timesteps": 64, "n_steps": 32}
     limit = {"max_episode_steps": 5}
-    options = conf(tmp_path, **{"CartPole-v1": entry, "train_env_kwargs": {"CartPole-v1": limit}})[:-2]
-    train("reinforce", *options, *arguments, "--eval-env-kwargs", "max_episode_steps:7", "--eval-freq", "32")
+    options = conf(tmp_path, **{"CartPole-v1": entry, "train_env_kwargs": {"CartPole-v1": limit}})
+    train("reinforce", *options, "--eval-freq", "32", *arguments)
     run = tmp_path / "reinforce" / RUN
-    # A pole does not fall within seven steps
+    # A pole does not fall within six steps
     assert {int(line.split(",")[1]) for line in (run / "0.monitor.csv").read_text().splitlines()[2:]} == {length}
-    assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
-    assert config_of(run) == entry | {"train_env_kwargs": limit}
+    assert np.load(run / "evaluations.npz")["ep_lengths"].min() > 5
+    assert config_of(run) == entry | {"train_env_kwargs": limit} | written
     zoo("enjoy", "--algo", "reinforce", "--env", "CartPole-v1", "-f", str(tmp_path), "-n", "50", "--no-render")
     assert min(map(int, re.findall(r"Episode Length (\d+)", capsys.readouterr().out))) > 5
+
+
+def test_an_entry_goes_before_the_section_of_train_env_kwargs(tmp_path):
+    entry = {"policy": "MlpPolicy", "n_timesteps": 64, "train_env_kwargs": {"max_episode_steps": 6}}
+    section = {"CartPole-v1": {"max_episode_steps": 5}}
+    train("reinforce", *conf(tmp_path, **{"CartPole-v1": entry, "train_env_kwargs": section}))
+    assert config_of(tmp_path / "reinforce" / RUN) == entry
+
+
+def test_the_shipped_train_env_kwargs_are_of_tasks_with_settings():
+    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
+    assert published["train_env_kwargs"].keys() <= published.keys()
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
