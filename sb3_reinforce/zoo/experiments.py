@@ -210,8 +210,7 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
                 raise ConfigurationError(f"{key} is the text {value!r}, as YAML reads it: write !!float {value}")
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
-    for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", TRAIN_ENV_KWARGS):
-        as_dict(key, hyperparams.get(key))
+    as_dict("monitor_kwargs", hyperparams.get("monitor_kwargs"))
     if not isinstance(hyperparams.get("normalize"), bool):
         as_dict("normalize", hyperparams.get("normalize"))
     for key in ("n_envs", "frame_stack"):
