@@ -28,7 +28,7 @@ BUDGETS = {
     "masks.py": "--seeds 0 --evaluate-at 256",
     "noise_scale.py": "--tasks CartPole-v1 --seeds 0 --timesteps 200 --output rows.csv",
     "peers.py": "--contenders REINFORCE --seeds 0 --timesteps 600",
-    "pendulum_optimum.py": "--seeds 0 --grid 11 9 3",
+    "pendulum_optimum.py": "--seeds 0 --gamma 1 --grid 11 9",
     "record_video": "-n 20",
     "scaling.py": "--n-envs 64 --timesteps 64 --rounds 1",
     "search_throughput.py": "--n-envs 2 --n-delta 2 --updates 1 --rounds 1",
