@@ -7,10 +7,13 @@ from cells import RESULTS, counted, markdown, read, short
 from tables import final
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.policies import natural
 
 SETTINGS = RESULTS.parents[2] / "sb3_reinforce" / "zoo" / "hyperparams" / "reinforce.yml"
 DEFAULTS = {name: str(each.default) for name, each in inspect.signature(REINFORCE).parameters.items()}
 DEFAULTS |= {"policy": "MlpPolicy", "normalize": "False", "train_env_kwargs": "{}"}
+# Constants of the natural step
+DEFAULTS |= {"damping": str(natural.DAMPING), "n_iterations": str(natural.N_ITERATIONS)}
 
 
 def shipped(task: str) -> dict[str, str]:

@@ -1,5 +1,5 @@
 """
-How do REINFORCE and FiniteDifference compare with A2C, PPO and ARS: by steps, by seconds, and at the end?
+How do REINFORCE and FiniteDifference compare with A2C, PPO, TRPO and ARS: by steps, by seconds, and at the end?
 
     python examples/benchmarks/compare.py --tasks CartPole-v1 LunarLander-v3 --seeds 0 1 2 3 4 --output results.csv
 
@@ -47,7 +47,7 @@ from sb3_reinforce.common.processes import Processes, place
 from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
-ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "ars")
+ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "trpo", "ars")
 SEARCHES = ("finite_difference", "ars")
 BUDGETS = {
     "CartPole-v1": 100_000, "Acrobot-v1": 500_000, "MountainCarContinuous-v0": 100_000, "LunarLander-v3": 200_000,

@@ -26,6 +26,7 @@ from sb3_reinforce.diagnostics.plots import COLOURS
 REPETITIONS = 2000
 LABELS = {
     "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
+    "trpo": "TRPO",
 }  # fmt: skip
 # Mean return of uniformly random actions (100 episodes), and of PPO in the Zoo's benchmark.md, whose versions of
 # LunarLander and MuJoCo's tasks are older

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_reinforce import REINFORCE, GymnasiumVecEnv
 from sb3_reinforce.diagnostics import compare_starts, sample
 from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 ENVS = {
@@ -59,6 +60,17 @@ def test_baselines_compare_within_the_group():
     th.testing.assert_close(BASELINES["time_mean"](rollout)[0], mean)
     th.testing.assert_close(BASELINES["leave_one_out"](rollout)[0], (4 * mean - rollout.returns[0]) / 3)
     assert ((BASELINES["optimal"](rollout)[0].reshape(2, 4) - returns).abs() <= 2.001).all()
+
+
+def test_advantages_are_normalized_over_all_groups():
+    """A mean and a standard deviation of each group would bias the gradient."""
+    env = DummyVecEnv([lambda: Scales(10.0)] * 8)
+    model = REINFORCE(
+        "MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, normalize_advantage=True, seed=2
+    ).learn(8)
+    raw, normalized = (training_batch(model.rollout, model.rollout_buffer, flag).weights for flag in (False, True))
+    assert raw.reshape(2, 4).std(1).unique().numel() == 2, "another seed: the groups have one deviation"
+    th.testing.assert_close(normalized, (raw - raw.mean()) / raw.std())
 
 
 def test_the_same_seed_gives_the_same_run_and_a_saved_model_goes_on(tmp_path):

@@ -71,7 +71,9 @@ def test_time_mean_is_short_by_one_nth(reward_to_go, n_episodes):
         ("leave_one_out", 2, False, 1),
         ("leave_one_out", 3, True, 1),
         ("optimal", 2, True, 1),
+        pytest.param("optimal", 3, True, 1, marks=pytest.mark.slow),
         ("time_mean", 2, False, 1 / 2),
+        pytest.param("time_mean", 3, False, 2 / 3, marks=pytest.mark.slow),
     ],
 )
 def test_groups_that_share_their_start(baseline, m, ragged, factor):

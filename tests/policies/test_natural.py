@@ -21,6 +21,7 @@ from torch.distributions import kl_divergence
 
 from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
 from sb3_reinforce.policies.natural import conjugate_gradients, natural_step, walk
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -172,6 +173,19 @@ def test_every_kind_of_policy_takes_it(name):
     assert len(found) == 3
     assert (found > 0.5 * 0.01).all() and (found <= 1.2 * 0.01).all()
     assert not th.equal(to_vector(model.policy.parameters()), before)
+
+
+@pytest.mark.parametrize("baseline", BASELINES)
+@pytest.mark.parametrize("reward_to_go", [True, False])
+@pytest.mark.parametrize("rollout", [{"n_steps": 20}, {"n_episodes": 12}], ids=str)
+def test_every_baseline_return_and_rollout_takes_it(baseline, reward_to_go, rollout):
+    env = DummyVecEnv([lambda: sums(BOX)] * 4)
+    model = REINFORCE(
+        "MlpPolicy", env, step="natural", baseline=baseline, reward_to_go=reward_to_go, gamma=0.9, seed=0, **rollout
+    )
+    found = divergences_of(model, 120)
+    assert len(found) >= 2
+    np.testing.assert_allclose(found, 0.01, rtol=0.2)
 
 
 def test_where_no_step_is_possible_the_parameters_stay():
