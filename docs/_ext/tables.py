@@ -8,14 +8,15 @@ README_TASKS = ("CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1", "Acrob
 
 
 def published(task: str, *algorithms: str) -> str:
-    """What the Zoo publishes for a task, or Tianshou where the Zoo has nothing, with the numbers of steps."""
+    """What the Zoo publishes for a task, or another source of an algorithm that it leaves out, with the steps."""
     rows = read("published")
-    mine = rows[(rows["task"] == task) & rows["algorithm"].isin(algorithms)]
-    zoo = mine[mine["source"].str.startswith("RL Zoo")]
-    shown = mine if zoo.empty else zoo
-    texts = [f"{LABELS[row.algorithm]} {number(row['return'])} [{short(row.timesteps)}]" for _, row in shown.iterrows()]
-    if zoo.empty and texts:
-        texts.append("by Tianshou")
+    texts = []
+    for name in algorithms:
+        mine = rows[(rows["task"] == task) & (rows["algorithm"] == name)]
+        zoo = mine[mine["source"].str.startswith("RL Zoo")]
+        for _, row in (mine if zoo.empty else zoo).iterrows():
+            source = f", {row['source'].split()[0]}" if zoo.empty else ""
+            texts.append(f"{LABELS[name]} {number(row['return'])} [{short(row['timesteps'])}{source}]")
     return ", ".join(texts) or NONE
 
 

@@ -5,7 +5,7 @@ How do REINFORCE and FiniteDifference compare with A2C, PPO, TRPO and ARS: by st
 
 All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the RL Zoo's
 settings (for another version of the task where it has none for this one), and ours take ``sb3_reinforce.zoo``'s; the
-two searches are run only on tasks that they have settings for.
+two searches and TRPO are run only on tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and

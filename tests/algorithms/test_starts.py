@@ -63,13 +63,14 @@ def test_baselines_compare_within_the_group():
 
 
 def test_advantages_are_normalized_over_all_groups():
-    """A mean and a standard deviation of each group would bias the gradient."""
+    """A standard deviation of each group would bias the gradient."""
     env = DummyVecEnv([lambda: Scales(10.0)] * 8)
     model = REINFORCE(
-        "MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, normalize_advantage=True, seed=2
+        "MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, normalize_advantage=True, seed=3
     ).learn(8)
     raw, normalized = (training_batch(model.rollout, model.rollout_buffer, flag).weights for flag in (False, True))
-    assert raw.reshape(2, 4).std(1).unique().numel() == 2, "another seed: the groups have one deviation"
+    first, second = raw.reshape(2, 4).std(1)
+    assert abs(first - second) > 0.1, "another seed: the groups have one deviation"
     th.testing.assert_close(normalized, (raw - raw.mean()) / raw.std())
 
 
