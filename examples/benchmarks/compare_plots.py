@@ -46,6 +46,7 @@ REFERENCES = {
     "Ant-v5": (-48.0, 1327.0),
     # Which benchmark.md does not have: PPO at 1M steps in Tianshou's examples/mujoco/README.md, on versions 2 and 3
     "InvertedPendulum-v5": (5.2, 1000.0),
+    "InvertedDoublePendulum-v5": (49.1, 9231.3),
     "Reacher-v5": (-43.3, -4.1),
     "Humanoid-v5": (112.6, 787.1),
 }
