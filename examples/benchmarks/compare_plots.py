@@ -49,6 +49,8 @@ REFERENCES = {
     "InvertedDoublePendulum-v5": (49.1, 9231.3),
     "Reacher-v5": (-43.3, -4.1),
     "Humanoid-v5": (112.6, 787.1),
+    # Version 2, median of six models that qgallouedec trained with the Zoo's PPO and put on the Hugging Face Hub
+    "HumanoidStandup-v5": (33320.2, 148896.1),
 }
 
 
