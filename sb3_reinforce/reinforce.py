@@ -233,8 +233,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return self._function("baseline", BASELINES) is BASELINES["value"]
 
     def _critic_rate(self) -> float:
-        name = "learning_rate" if self.critic_learning_rate is None else "critic_learning_rate"
-        return self._scheduled(name)
+        if self.critic_learning_rate is None:
+            return self.lr_schedule(self._current_progress_remaining)
+        return self._scheduled("critic_learning_rate")
 
     def _setup_model(self) -> None:
         check_reinforce(self, BASELINES)
@@ -400,12 +401,12 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         rollout = cast(Rollout, self.rollout)
         ent_coef = self._scheduled("ent_coef")
-        critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)
         route = route_of(self.policy, with_critic=rollout.values is not None)
         actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        critic_rate = self._critic_rate()
 
         # The natural step bounds the policy's change, which the critic's error would be no part of
         with_values = bool(shared) and self.step == "optimizer"

@@ -65,6 +65,12 @@ class BasePolicyGradient(Distributed):
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = self._schedule("learning_rate")
 
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        # A callback may have set another one
+        if self._schedules["learning_rate"].given is not self.learning_rate:
+            self._setup_lr_schedule()
+        super()._update_learning_rate(optimizers)
+
     def _schedule(self, name: str) -> CheckedSchedule:
         """Return the checked schedule of an argument, a new one where a callback has set another value."""
         given = getattr(self, name)

@@ -268,6 +268,16 @@ def test_schedules_are_followed():
     assert temperatures.records[-1] == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize("kind", ["steps", "search"])
+@pytest.mark.parametrize(("name", "value"), [("learning_rate", 0.25), ("lr_schedule", lambda progress: 0.25)])
+def test_a_learning_rate_set_later_is_the_rate_of_each_optimizer(name, value, kind):
+    model = make(kind, learning_rate=1e-3).learn(16)
+    setattr(model, name, value)
+    model.learn(16, reset_num_timesteps=False)
+    optimizers = [model.policy.optimizer, getattr(model, "critic_optimizer", model.policy.optimizer)]
+    assert [rate_of(optimizer) for optimizer in optimizers] == [0.25, 0.25]
+
+
 @pytest.mark.parametrize("space", [TWO, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3)], ids=str)
 def test_temperature_divides_the_logits(space):
     models = [make("steps", Corridor(action_space=space), temperature=t, seed=0) for t in (1.0, 0.25)]
