@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
 from sb3_reinforce.policies.evaluation import action_distribution
+from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -50,6 +51,20 @@ class History:
 Pitfall: TypeAlias = Callable[[History], str | None]
 
 
+def present(value: Any, history: History) -> float:
+    """The present value of an argument that may be a schedule."""
+    return float(value(history.progress_remaining) if callable(value) else value)
+
+
+def step_bound(history: History) -> tuple[str, float]:
+    """The argument that bounds a step of the policy, and its present value."""
+    model = history.model
+    if model.step == "natural":
+        target_kl = DEFAULT_TARGET_KL if model.target_kl is None else model.target_kl
+        return "target_kl", present(target_kl, history)
+    return "learning_rate", present(model.lr_schedule, history)
+
+
 def rate_too_large(history: History) -> str | None:
     """
     A KL divergence above 1 in one update, a median above 0.1 over ten, or a loss of more than half of the randomness
@@ -62,16 +77,17 @@ def rate_too_large(history: History) -> str | None:
     if history.progress_remaining > 0.5 and before < 0.05:
         # Without randomness any rate is too large: see deterministic_too_early
         return None
-    remedy = f"Lower the learning rate, now {history.model.lr_schedule(history.progress_remaining):.2g}"
+    argument, value = step_bound(history)
+    remedy = f"Lower {argument} (now {value:.2g})"
     if steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1):
         return (
             f"The policy leaps: its KL divergence from one update to the next is {steps[-1]:.2g} (median of the last "
-            f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let learning_rate decay"
+            f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let it decay"
         )
     if before - after > 0.5 and updates[-1].temperature > 0.9 * updates[0].temperature:
         return (
             f"The entropy collapses: within {len(steps)} updates the policy went from {before:.0%} to {after:.0%} of "
-            f"the randomness that it could have. {remedy} (learning_rate), or raise ent_coef"
+            f"the randomness that it could have. {remedy}, or raise ent_coef"
         )
     return None
 
@@ -124,9 +140,10 @@ def uses_total_return(history: History) -> str | None:
 
 
 def spikes_without_clipping(history: History) -> str | None:
-    """A gradient ten times as long as usual, without a bound on its norm."""
+    """A gradient ten times as long as usual, without a bound on its norm: the natural step does not depend on it."""
     norms = [update.grad_norm for update in history.updates]
-    if history.model.max_grad_norm in (None, math.inf) and len(norms) >= 20 and norms[-1] > 10 * median(norms[:-1]) > 0:
+    is_unbounded = history.model.step == "optimizer" and history.model.max_grad_norm in (None, math.inf)
+    if is_unbounded and len(norms) >= 20 and norms[-1] > 10 * median(norms[:-1]) > 0:
         return (
             f"A gradient has norm {norms[-1]:.3g}, and the median is {median(norms[:-1]):.3g}: one such batch can undo "
             "what was learned. Set max_grad_norm, 0.5 for example"
@@ -157,12 +174,11 @@ def deterministic_too_early(history: History) -> str | None:
         remedy = f"raise temperature (now {history.updates[-1].temperature:.2g})"
         if isinstance(history.model.action_space, spaces.Box):
             remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
-        ent_coef: Any = history.model.ent_coef
-        present = ent_coef(left) if callable(ent_coef) else ent_coef
+        ent_coef = present(history.model.ent_coef, history)
         return (
             f"With {left:.0%} of the training left the policy is all but deterministic ({share:.1%} of the randomness "
-            f"that it could have), and its scores vanish. Raise ent_coef (now {float(present):.2g}), {remedy}, or "
-            "lower learning_rate"
+            f"that it could have), and its scores vanish. Raise ent_coef (now {ent_coef:.2g}), "
+            f"{remedy}, or lower {step_bound(history)[0]}"
         )
     return None
 

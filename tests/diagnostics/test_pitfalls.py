@@ -60,7 +60,7 @@ narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
 @pytest.mark.parametrize(
     ("name", "argument", "env", "timesteps", "kwargs"),
     [
-        ("rate_too_large", "learning rate, now 1", "CartPole-v1", 2000, {"learning_rate": 1.0}),
+        ("rate_too_large", "Lower learning_rate (now 1)", "CartPole-v1", 2000, {"learning_rate": 1.0}),
         ("unscaled_returns", "VecNormalize", rewarded((5,), lambda t, action: 5e3), 64, {}),
         ("too_few_episodes", "n_episodes", rewarded((4,), noise), 400, whole),
         ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
@@ -131,6 +131,19 @@ def test_a_pitfall_starts_at_its_threshold(name, falls, stays):
     assert PITFALLS[name](history(*stays)) is None
 
 
+@pytest.mark.parametrize(
+    ("name", "case"), [("rate_too_large", seen({"kl": 1.5})), ("deterministic_too_early", seen(fixed))]
+)
+def test_the_natural_step_is_shortened_by_its_target(name, case):
+    sentence = PITFALLS[name](history(*case[:3], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
+    assert "ower target_kl" in sentence and "learning_rate" not in sentence
+
+
+def test_a_spike_does_not_lengthen_the_natural_step():
+    case = seen(*[{}] * 20, spike, max_grad_norm=None, step="natural")
+    assert PITFALLS["spikes_without_clipping"](history(*case)) is None
+
+
 def test_of_several_pitfalls_with_one_cause_the_cause_is_reported():
     assert set(fall("CartPole-v1", 8000, learning_rate=1.0)) == {"rate_too_large"}
 
@@ -192,7 +205,7 @@ def test_a_callback_serves_one_model_after_another():
 
 def test_a_schedule_is_reported_by_its_present_value():
     found = fall("CartPole-v1", 500, learning_rate=lambda progress: progress, ent_coef=lambda progress: 0.0)
-    assert "learning rate, now 0." in found["rate_too_large"] or "learning rate, now 1" in found["rate_too_large"]
+    assert "Lower learning_rate (now 0." in found["rate_too_large"]
     assert "<function" not in "".join(found.values())
 
 
