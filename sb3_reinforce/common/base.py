@@ -13,7 +13,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common import storage
-from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_flag, check_function
+from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device, check_flag, check_function
 from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
@@ -22,7 +22,7 @@ from sb3_reinforce.common.spaces import check_env, shift_to_start
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
-LOAD_ARGUMENTS = {"device", "custom_objects", "print_system_info", "force_reset"}
+LOAD_ARGUMENTS = {"custom_objects", "print_system_info", "force_reset"}
 # What a state dict of either algorithm may have
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
@@ -133,6 +133,7 @@ class BasePolicyGradient(Distributed):
         cls: type[Model],
         path: storage.PathOrFile,
         env: GymEnv | None = None,
+        device: th.device | str = "auto",
         *args: Any,
         restore_random_state: bool = False,
         **kwargs: Any,
@@ -142,6 +143,7 @@ class BasePolicyGradient(Distributed):
 
         :param path: The file
         :param env: The environment to continue in; None for prediction alone
+        :param device: Device on which the model is loaded
         :param args: Further arguments of ``load`` in Stable-Baselines3
         :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
             device) into the state in which they were when the model was saved. Training then continues as if it had
@@ -153,6 +155,7 @@ class BasePolicyGradient(Distributed):
         :raises TypeError: If an argument is of the wrong type, or the algorithm has none of this name
         :raises ValueError: If an argument is out of its range, or the file is damaged or has no random state
         """
+        check_device("device", device)
         check_flag("restore_random_state", restore_random_state)
         saved = storage.check_archive(path, ("data", "policy.pth"))
         if cls._own_argument not in saved:
@@ -170,7 +173,7 @@ class BasePolicyGradient(Distributed):
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         if env is not None:
             env = check_env(env, verbose=0)
-        model = super().load(path, env, *args, **kwargs)
+        model = super().load(path, env, device, *args, **kwargs)
         if restore_random_state:
             storage.restore_generators(model._random_state, model.device)
         elif kwargs.get("seed") is not None:
@@ -184,9 +187,10 @@ class BasePolicyGradient(Distributed):
 
         :param env: As many environments as before, with the same spaces
         :param force_reset: Whether to reset them before training
-        :raises TypeError: If ``env`` is no environment
+        :raises TypeError: If ``env`` is no environment, or ``force_reset`` no flag
         :raises ValueError: If their number or spaces are others
         """
+        check_flag("force_reset", force_reset)
         super().set_env(check_env(env, self.verbose, self.n_envs), force_reset)
 
     def set_parameters(
@@ -206,11 +210,13 @@ class BasePolicyGradient(Distributed):
             some may be missing, FiniteDifference leaves out REINFORCE's ``critic_optimizer``, and the state of another
             kind of optimizer is left out, with a warning
         :param device: Device on which the parameters are loaded
-        :raises TypeError: If a state is not a dict
+        :raises TypeError: If an argument is of the wrong type, or a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
             to other parameters
         :raises RuntimeError: If the parameters of the policy have other names or shapes
         """
+        check_flag("exact_match", exact_match)
+        check_device("device", device)
         states = load_path_or_dict
         if not isinstance(states, dict):
             storage.check_archive(states, ("policy.pth",))

@@ -36,6 +36,8 @@ MAX_LEARNING_RATE = 1e6
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
+# With this one float32 samples do not depend on the mean
+MAX_STD = 1e6
 STACK_FRAMES = "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
 MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
@@ -62,6 +64,7 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
         raise ValueError(f"policy must be one that this algorithm trains, got {given}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
+    check_subclass("policy", policy, ActorCriticPolicy)
 
 
 def check_callback(name: str, value: Any) -> Any:
@@ -103,7 +106,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "batch_size": check_count,
     "critic_learning_rate": optional(partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE)),
     "temperature": partial(CheckedSchedule, low=0, above=True, high=MAX_TEMPERATURE),
-    "min_std": partial(check_number, low=0),
+    "min_std": partial(check_number, low=0, high=MAX_STD),
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),
     "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
@@ -197,9 +200,10 @@ def check_starts(model: Any) -> None:
 def check_finite_difference(model: Any, estimators: Functions, perturbations: Functions) -> None:
     """Check the arguments of a FiniteDifference."""
     check_attributes(model, FINITE_DIFFERENCE_ARGUMENTS)
-    check_subclass("policy", model.policy_class, ActorCriticPolicy)
     check_function("estimator", model.estimator, estimators)
     check_function("perturbation", model.perturbation, perturbations)
+    if model.policy_kwargs.get("use_sde"):
+        raise ValueError("policy_kwargs must not have use_sde=True: FiniteDifference perturbs parameters, not actions")
     if model.n_delta == 1 and model.estimator == "regression":
         raise ValueError("n_delta must be at least 2 with estimator='regression', which fits an intercept too, got 1")
     if model.n_top is not None and model.estimator != "central":

@@ -16,6 +16,7 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
@@ -114,6 +115,8 @@ RECURRENT, MASKABLE = (
         ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),
         ("search", {"n_top": 1, "estimator": "forward"}, ["n_top=1", "'central'", "'forward'"]),
         ("search", {"policy": th.nn.Linear}, ["policy", "ActorCriticPolicy", "Linear"]),
+        ("steps", {"policy": SACPolicy}, ["policy", "ActorCriticPolicy", "SACPolicy"]),
+        ("search", {"env": "Pendulum-v1", "policy_kwargs": {"use_sde": True}}, ["policy_kwargs", "use_sde=True"]),
     ],
 )
 def test_arguments_that_do_not_go_together(kind, wrong, words):
@@ -274,6 +277,25 @@ def test_load_checks_the_argument_for_the_random_state(kind, tmp_path):
         KINDS[kind][0].load(tmp_path / "without", restore_random_state=True)
     assert th.equal(th.get_rng_state(), before)
     KINDS[kind][0].load(tmp_path / "without", device="cpu")
+
+
+@both
+@pytest.mark.parametrize("value", ["gpu9", 3])
+def test_a_wrong_device_is_named_where_a_file_is_read(kind, value, tmp_path):
+    model = make(kind)
+    model.save(tmp_path / "model")
+    for read in (KINDS[kind][0].load, model.set_parameters):
+        with pytest.raises((TypeError, ValueError), match=f"device must be .*{value}"):
+            read(tmp_path / "model", device=value)
+
+
+@both
+def test_a_wrong_flag_is_named(kind):
+    model = make(kind)
+    with pytest.raises(TypeError, match="exact_match must be True or False, got 'no'"):
+        model.set_parameters(model.get_parameters(), exact_match="no")
+    with pytest.raises(TypeError, match="force_reset must be True or False, got 'no'"):
+        model.set_env(make_vec_env("CartPole-v1", 1), force_reset="no")
 
 
 @both
