@@ -536,6 +536,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.n_steps is None:
+            # The environments may have been used since their last episodes ended
+            self._last_obs = None
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         # The first rollout has the temperature of the start, not the final one of an earlier run
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))

@@ -32,6 +32,13 @@ def test_episodes_are_shared_out_evenly_and_begin_with_the_rollout(n_episodes, n
         assert rollout.timesteps[0].tolist() == [0] * n_envs
 
 
+def test_whole_episodes_begin_with_a_reset_where_the_user_has_stepped_the_environment():
+    model = make_model(lambda: Corridor((3,)), n_episodes=2, baseline="none").learn(6)
+    model.env.step(np.zeros(1, dtype=int))
+    model.learn(1, reset_num_timesteps=False)
+    assert model.rollout_buffer.observations[:, 0].argmax(-1).tolist() == [0, 1, 2] * 2
+
+
 def test_lengths_of_used_episodes_are_drawn_without_bias():
     """Lengths of 1 and 100: "the first to finish" would use far more short ones than half."""
     model = make_model(lambda: Corridor((1, 100)), 4, n_episodes=6, baseline="none", learning_rate=0.0)
