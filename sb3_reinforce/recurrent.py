@@ -1,6 +1,6 @@
 """REINFORCE with a memory, for tasks in which one observation does not say enough."""
 
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,6 +23,7 @@ from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurre
 
 __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
 
+SelfRecurrentREINFORCE = TypeVar("SelfRecurrentREINFORCE", bound="RecurrentREINFORCE")
 
 # What sb3-contrib's policies compute for one step, and what computes it for whole sequences
 SEQUENCE_METHODS = {
@@ -105,15 +106,45 @@ class RecurrentREINFORCE(REINFORCE):
                 )
 
     def _setup_model(self) -> None:
-        has_dicts = isinstance(self.observation_space, spaces.Dict)
+        space = self.observation_space
+        has_dicts = isinstance(space, spaces.Dict)
+        parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+        has_numbers = any(isinstance(part, spaces.MultiDiscrete) for part in parts)
+        if has_numbers and "features_extractor_class" not in self.policy_kwargs:
+            raise ValueError(
+                "env must not have MultiDiscrete observations, whose size is no int to the memories of PyTorch: wrap "
+                f"it in gymnasium.wrappers.FlattenObservation, got {space}"
+            )
         if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy):
             fitting = MultiInputLstmPolicy if has_dicts else MlpLstmPolicy
             if self.policy_class is not fitting:
                 raise ValueError(
-                    f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
-                    f"{self.policy_class.__name__}"
+                    f"policy must be {fitting.__name__} for observations in {space}, got {self.policy_class.__name__}"
                 )
         super()._setup_model()
+
+    def learn(
+        self: SelfRecurrentREINFORCE,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 10,
+        tb_log_name: str = "RecurrentREINFORCE",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfRecurrentREINFORCE:
+        """
+        Train as :meth:`REINFORCE.learn <sb3_reinforce.REINFORCE.learn>`, with a different name in the log.
+
+        :param total_timesteps: Environment steps, of all environments together; the last rollout is finished
+        :param callback: Called at each step of the environments
+        :param log_interval: Rollouts between two entries of the log; None for no log
+        :param tb_log_name: The name of the run for tensorboard
+        :param reset_num_timesteps: Whether to reset the count of steps and the environments
+        :param progress_bar: Display a progress bar using tqdm and rich
+        :return: The trained model
+        :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_actor"]

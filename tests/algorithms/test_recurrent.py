@@ -1,5 +1,6 @@
 """RecurrentREINFORCE: exact gradients through whole episodes, V where they are cut, states that are carried on."""
 
+from inspect import signature
 from itertools import product
 
 import gymnasium as gym
@@ -18,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines, landscape
 from sb3_reinforce.estimation import BASELINES
@@ -260,6 +261,12 @@ THREE = np.zeros((3, 4), dtype=np.float32)
 TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
 
 
+def observing(space):
+    """A model for observations in a space."""
+    name = "MultiInputLstmPolicy" if isinstance(space, spaces.Dict) else "MlpLstmPolicy"
+    return lambda env: RecurrentREINFORCE(name, Random(space, spaces.Discrete(2)))
+
+
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
@@ -272,6 +279,8 @@ TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
             lambda env: RecurrentREINFORCE("MultiInputLstmPolicy", env),
             "policy must be MlpLstmPolicy for observations in",
         ),
+        (observing(spaces.MultiDiscrete([2, 3])), "MultiDiscrete .*wrap it in gymnasium.wrappers.FlattenObservation"),
+        (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "wrap it in .*FlattenObservation, got Dict"),
         (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
         (memory(memory="LSTM"), "memory must be one of lstm, gru, rnn"),
         (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
@@ -292,3 +301,8 @@ TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
 def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
     with pytest.raises(ValueError, match=sentence):
         call(make_vec_env("CartPole-v1"))
+
+
+@pytest.mark.parametrize("algorithm", [REINFORCE, RecurrentREINFORCE, FiniteDifference])
+def test_the_log_has_the_name_of_the_algorithm(algorithm):
+    assert signature(algorithm.learn).parameters["tb_log_name"].default == algorithm.__name__
