@@ -1,6 +1,5 @@
 """What both algorithms inherit: checked arguments, prediction, saving, loading and going on."""
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from inspect import signature
@@ -238,22 +237,7 @@ class BasePolicyGradient(Distributed):
         try:
             # The policy comes first, and with it a mismatch that is named by its parameters
             for name, state in own.items():
-                self._set_state(name, state, exact_match)
+                storage.load_state(recursive_getattr(self, name), name, state, exact_match)
         except BaseException:
             super().set_parameters(before)
             raise
-
-    def _set_state(self, name: str, state: Any, exact_match: bool) -> None:
-        """Load one state; another kind of optimizer's is left out, or with ``exact_match`` an error."""
-        part = recursive_getattr(self, name)
-        if isinstance(part, th.nn.Module):
-            part.load_state_dict(state, strict=exact_match)
-            return
-        reason = storage.optimizer_mismatch(part, state)
-        needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
-        if reason and exact_match:
-            raise ValueError(f"{needed}, but {reason}")
-        if reason:
-            warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
-        else:
-            part.load_state_dict(state)

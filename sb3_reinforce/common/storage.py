@@ -112,6 +112,21 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
     return ""
 
 
+def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
+    """Load the state of a module or an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
+    if isinstance(part, th.nn.Module):
+        part.load_state_dict(state, strict=exact_match)
+        return
+    reason = optimizer_mismatch(part, state)
+    needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
+    if reason and exact_match:
+        raise ValueError(f"{needed}, but {reason}")
+    if reason:
+        warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
+    else:
+        part.load_state_dict(state)
+
+
 def generator_states(device: th.device) -> bytes:
     """Return the states of the global random generators, as bytes, which Stable-Baselines3 does not print."""
     cuda = th.cuda.get_rng_state(device) if device.type == "cuda" else None
