@@ -106,20 +106,13 @@ class RecurrentREINFORCE(REINFORCE):
                 )
 
     def _setup_model(self) -> None:
-        space = self.observation_space
-        has_dicts = isinstance(space, spaces.Dict)
-        parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-        has_numbers = any(isinstance(part, spaces.MultiDiscrete) for part in parts)
-        if has_numbers and "features_extractor_class" not in self.policy_kwargs:
-            raise ValueError(
-                "env must not have MultiDiscrete observations, whose size is no int to the memories of PyTorch: wrap "
-                f"it in gymnasium.wrappers.FlattenObservation, got {space}"
-            )
+        has_dicts = isinstance(self.observation_space, spaces.Dict)
         if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy):
             fitting = MultiInputLstmPolicy if has_dicts else MlpLstmPolicy
             if self.policy_class is not fitting:
                 raise ValueError(
-                    f"policy must be {fitting.__name__} for observations in {space}, got {self.policy_class.__name__}"
+                    f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
+                    f"{self.policy_class.__name__}"
                 )
         super()._setup_model()
 
@@ -139,7 +132,8 @@ class RecurrentREINFORCE(REINFORCE):
         :param callback: Called at each step of the environments
         :param log_interval: Rollouts between two entries of the log; None for no log
         :param tb_log_name: The name of the run for tensorboard
-        :param reset_num_timesteps: Whether to reset the count of steps and the environments
+        :param reset_num_timesteps: Whether to reset the count of steps, and the environments; whole episodes always
+            begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`

@@ -234,6 +234,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _critic_rate(self) -> float:
         if self.critic_learning_rate is None:
+            self._renew_lr_schedule()
             return self.lr_schedule(self._current_progress_remaining)
         return self._scheduled("critic_learning_rate")
 
@@ -318,9 +319,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
             if collected is None:
                 return False
-            dones, terminal_obs, route = collected
+            # Not named dones, which in a callback's locals are those of the last step, as with A2C
+            all_dones, terminal_obs, route = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
-            own = Columns(dones, terminal_obs, self._last_obs, extent.quota, self._state)
+            own = Columns(all_dones, terminal_obs, self._last_obs, extent.quota, self._state)
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
                 self.rollout = self._complete(rollout_buffer, columns, route, is_fixed=n_rollout_steps is not None)
@@ -401,12 +403,12 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         rollout = cast(Rollout, self.rollout)
         ent_coef = self._scheduled("ent_coef")
+        critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)
         route = route_of(self.policy, with_critic=rollout.values is not None)
         actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        critic_rate = self._critic_rate()
 
         # The natural step bounds the policy's change, which the critic's error would be no part of
         with_values = bool(shared) and self.step == "optimizer"
@@ -525,7 +527,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param callback: Called at each step of the environments
         :param log_interval: Rollouts between two entries of the log; None for no log
         :param tb_log_name: The name of the run for tensorboard
-        :param reset_num_timesteps: Whether to reset the count of steps and the environments
+        :param reset_num_timesteps: Whether to reset the count of steps, and the environments; whole episodes always
+            begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, or processes under
@@ -536,10 +539,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.n_steps is None:
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+        if self.n_steps is None and self.num_timesteps > 0:
             # The environments may have been used since their last episodes ended
             self._last_obs = None
-        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         # The first rollout has the temperature of the start, not the final one of an earlier run
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         return total_timesteps, callback

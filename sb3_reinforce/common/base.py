@@ -64,10 +64,14 @@ class BasePolicyGradient(Distributed):
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = self._schedule("learning_rate")
 
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        # A callback may have set another one
-        if self._schedules["learning_rate"].given is not self.learning_rate:
+    def _renew_lr_schedule(self) -> None:
+        """Follow another learning rate that a callback has set."""
+        held = self._schedules.get("learning_rate")
+        if held is not None and held.given != self.learning_rate:
             self._setup_lr_schedule()
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        self._renew_lr_schedule()
         super()._update_learning_rate(optimizers)
 
     def _schedule(self, name: str) -> CheckedSchedule:
@@ -185,7 +189,7 @@ class BasePolicyGradient(Distributed):
         Continue in another environment.
 
         :param env: As many environments as before, with the same spaces
-        :param force_reset: Whether to reset them before training
+        :param force_reset: Whether to reset them before training; whole episodes always begin with a reset
         :raises TypeError: If ``env`` is no environment, or ``force_reset`` no flag
         :raises ValueError: If their number or spaces are others
         """

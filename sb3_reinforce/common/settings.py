@@ -36,7 +36,7 @@ MAX_LEARNING_RATE = 1e6
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
-# With this one float32 samples do not depend on the mean
+# Noise this strong drowns the mean
 MAX_STD = 1e6
 STACK_FRAMES = "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
 MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
@@ -64,7 +64,6 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
         raise ValueError(f"policy must be one that this algorithm trains, got {given}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
-    check_subclass("policy", policy, ActorCriticPolicy)
 
 
 def check_callback(name: str, value: Any) -> Any:
@@ -145,6 +144,7 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
         value = check(name, getattr(model, attribute))
         if not isinstance(value, CheckedSchedule):
             setattr(model, attribute, value)
+    check_subclass("policy", model.policy_class, ActorCriticPolicy)
     space = model.observation_space
     if model.policy_class is MultiInputActorCriticPolicy and not isinstance(space, spaces.Dict):
         raise ValueError(f"policy must be MlpPolicy or CnnPolicy for observations in {space}, got MultiInputPolicy")

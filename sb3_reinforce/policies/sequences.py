@@ -14,6 +14,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence
 from torch.utils.checkpoint import checkpoint
@@ -61,6 +62,16 @@ class RecurrentPolicy(ActorCriticPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         # sb3-contrib leaves them out, and a policy that is loaded would have other shapes
         return super()._get_constructor_parameters() | self.memory_arguments
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Make a features extractor, and refuse one whose size PyTorch's memories do not take."""
+        extractor = super().make_features_extractor()
+        if not isinstance(extractor.features_dim, int):
+            raise ValueError(
+                "observation_space must have no MultiDiscrete part, whose size is not an int, for a policy with a "
+                f"memory: give these numbers as a Box, got {self.observation_space}"
+            )
+        return extractor
 
     def set_training_mode(self, mode: bool) -> None:
         """Set the mode of all parts but of memories without dropout: cuDNN has no backward pass in evaluation mode."""

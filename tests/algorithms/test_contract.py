@@ -164,6 +164,12 @@ def test_a_callback_stops_training_at_the_very_step(kind):
     assert model.num_timesteps >= 62
 
 
+def test_at_the_end_of_a_rollout_a_callback_finds_the_dones_of_its_last_step():
+    ends = Record(lambda model: ends.locals["dones"].tolist())
+    make("steps", make_vec_env(lambda: Corridor((4,)), 2)).learn(32, ends)
+    assert ends.records == [[True, True]] * 2
+
+
 @all_kinds
 def test_callbacks_of_sb3(kind, tmp_path):
     pytest.importorskip("rich")

@@ -291,6 +291,19 @@ def test_processes_draw_other_actions_and_take_over_what_a_callback_changes(tmp_
     assert (restored[0] != restored[1]).any() and (seeded[0] != seeded[1]).any() and (changed == 1).all()
 
 
+def observations_of_all(rank):
+    """Of whole episodes after the user has stepped the environments."""
+    model = make("episodes", corridors(1, (3,))).learn(1)
+    model.env.step(np.zeros(1, dtype=int))
+    model.learn(1, reset_num_timesteps=False)
+    return model.rollout_buffer.observations.argmax(-1).T.tolist()
+
+
+def test_whole_episodes_begin_with_a_reset_in_all_processes(tmp_path):
+    observations, _ = in_processes(2, observations_of_all, tmp_path)
+    assert observations == [[0, 1, 2], [0, 1, 2]]
+
+
 def returns_in_window(rank):
     model = make("steps", corridors(2, (3,), lambda t, action: float(rank)), n_steps=3, stats_window_size=2)
     model.learn(24)
