@@ -28,7 +28,7 @@ copybutton_exclude = ".linenos, .gp, .go"
 myst_enable_extensions = ["colon_fence", "dollarmath", "substitution"]
 html_math_renderer = "mathml"
 myst_heading_anchors = 3
-# Written from the committed CSVs: no number of a result stands in a page
+# The tables of results, computed from the committed CSVs
 myst_substitutions = tables.all_tables() | {"tuning": tuning.table()}
 
 # The lesson's pages are examples/*.py. A page is executed again only when its code has changed

@@ -105,8 +105,8 @@ for name, (env, timesteps, arguments) in runs.items():
     assert name in found
 
 # %% [markdown]
-# Each sentence names the argument to change. The healthy run: the same CartPole as in the first one, with the default
-# learning rate.
+# Each sentence names the argument to change. The healthy run: CartPole with the default learning rate and rollouts of
+# 256 steps.
 
 # %%
 found = run("CartPole-v1", 5000, n_steps=256)

@@ -10,7 +10,7 @@
 # $$\hat g = \frac{1}{N} \sum_{i=1}^{N} \sum_t \nabla_\theta \log \pi_\theta(a_t \mid s_t) \, (G_t - b_t),$$
 #
 # and takes one step along it. $G_t$ is the reward from step $t$ on and $b_t$ a baseline: here the mean of $G_t$ over
-# the other episodes. The physics of the cart is not in the formula. It does not depend on $\theta$, so they drop out of
+# the other episodes. The dynamics of the cart are not in the formula: they do not depend on $\theta$ and drop out of
 # $\nabla_\theta \log p_\theta(\text{episode})$.
 
 # %%

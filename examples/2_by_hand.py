@@ -126,8 +126,9 @@ assert (rollout.returns - mean(rollout)).flatten().tolist() == [-2, 0, 2]
 assert (rollout.returns - leave_one_out(rollout)).flatten().tolist() == [-3, 0, 3]
 
 # %% [markdown]
-# Both gradients have the same mean. But if every drawn action gains, then most of a gradient tells which actions
-# happened to be drawn. Over the three equally likely episodes the variance can be computed exactly:
+# Without a baseline and with the constant baseline 10, the gradient has the same mean. But if every drawn action gains,
+# then most of a gradient tells which actions happened to be drawn. Over the three equally likely episodes the variance
+# can be computed exactly:
 
 # %%
 scores = np.eye(3) - 1 / 3

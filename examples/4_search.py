@@ -42,8 +42,9 @@ print(f"Mean return of 20 episodes after {model.num_timesteps:,} steps: {mean:.1
 assert mean > 200, mean
 
 # %% [markdown]
-# The perturbations are twice as many as the parameters, so that noise is averaged out, and 1 % of $\|\theta\|$ long,
-# but at least 0.05. R² says how much of the returns the plane explains: less, the more returns are luck.
+# There are twice as many perturbations as parameters, to average out noise. Each parameter changes with a standard
+# deviation of 1 % of $\|\theta\|$, but at least 0.05. R² says how much of the returns the plane explains: less, the
+# more returns are luck.
 #
 # ## Coordinates or random directions?
 #

@@ -45,7 +45,7 @@ assert check.passed
 # ## Signal from a step
 #
 # One estimate is one episode for the likelihood ratio. For the others it is one episode for each perturbed policy. The
-# cosine is the one of the *expected* estimate to the gradient; the signal-to-noise ratio is divided by the steps.
+# cosine is between the *expected* estimate and the gradient; the signal-to-noise ratio is divided by the steps.
 
 # %%
 table = compare_estimators(model, n_episodes=200, n_estimates=20, seed=seed)

@@ -29,9 +29,9 @@ generator = np.random.default_rng(seed)
 
 # %%
 def climb(rate, n_episodes, with_baseline, n_updates=200, n_runs=1000):
-    """The mean of π(Right) over the runs after each update."""
+    """The mean of π(Right) over the runs, before the first update and after each."""
     theta, means = np.zeros((n_runs, 1)), []
-    for _ in range(n_updates):
+    for _ in range(n_updates + 1):
         p = 1 / (1 + np.exp(-theta))
         right = generator.random((n_runs, n_episodes)) < p
         returns = np.where(right, 12.0, 8.0)
@@ -99,7 +99,7 @@ assert callback.scales[-1] > 1.5 * callback.scales[0]
 # %% [markdown]
 # ## Two guards
 #
-# `max_grad_norm` bounds the length of a step, so one unlucky batch cannot undo what was learned.
+# `max_grad_norm` bounds the norm of the gradient, which limits the weight of one unlucky batch.
 # `normalize_advantage=True` scales the weights of a batch to mean 0 and standard deviation 1. Then rewards that are 100
 # times as large make the same step:
 

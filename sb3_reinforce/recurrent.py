@@ -39,7 +39,7 @@ class RecurrentREINFORCE(REINFORCE):
 
     By default a rollout is a number of whole episodes, and its gradient is exact: it is propagated back through each
     complete episode, and no state is older than the parameters. In fixed rollouts (``n_steps``) the state is carried
-    on, and the gradient is cut where the rollout starts, as in every other implementation. V at a time limit or at a
+    on, and the gradient is cut where the rollout starts, as in sb3-contrib's RecurrentPPO. V at a time limit or at a
     cut comes from one more step of its sequence. The critic's minibatches are whole sequences of about ``batch_size``
     steps.
 

@@ -61,10 +61,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
-    (Williams, 1992, equation 4 and theorem 1; γ^t only with ``discount_scores``). m_t is 1 where the return of the step
-    is known, else 0. The denominator is ``n_steps * n_envs`` for fixed rollouts; for whole episodes see
-    ``normalize_by``. With ``baseline="none"`` or ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``,
-    ``discount_scores=True`` and no normalization or clipping, E[ĝ] is exactly ∇θ E[G_0].
+    (Williams, 1992, equation 4 and theorem 1; γ^t only with ``discount_scores``). m_t is 1 for the steps that are used:
+    those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
+    ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"`` or
+    ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no normalization or
+    clipping, E[ĝ] is exactly ∇θ E[G_0].
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -87,8 +88,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
     :param vf_coef: Weight of the critic's squared error in the optimizer's step, where a features extractor is shared
-    :param max_grad_norm: Bound on the norm of a step's gradient, for actor and critic apart; None or inf for no
-        bound
+    :param max_grad_norm: Bound on the norm of a step's gradient, separately for actor and critic; None or inf for
+        no bound
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. All environments are reset, and each

@@ -157,5 +157,5 @@ def test_the_readme_is_short_and_its_results_are_those_of_the_rows(monkeypatch: 
     import tables
 
     assert tables.readme() in TEXTS["README.md"]
-    assert f"it makes {tables.images()} of A2C's steps a second" in TEXTS["README.md"]
+    assert f"REINFORCE makes {tables.images()} of A2C's steps a second" in TEXTS["README.md"]
     assert len(TEXTS["README.md"].splitlines()) <= 130

@@ -22,7 +22,7 @@ from sb3_reinforce.policies import parameters as vectors
 from sb3_reinforce.policies.evaluation import Parameters, action_distribution
 
 DEFAULT_TARGET_KL = 0.01
-# λ and the number of iterations, as in TRPO (Schulman et al., 2015, appendix C)
+# c and the number of iterations, as in TRPO (Schulman et al., 2015, appendix C)
 DAMPING = 0.1
 N_ITERATIONS = 10
 # A step whose measured divergence exceeds the target by this factor is shortened, by half at most
@@ -43,7 +43,7 @@ def natural_step(
     damping: float = DAMPING,
 ) -> tuple[float, float]:
     """
-    ``θ ← θ − α d`` with ``(F + λ I) d = g`` and ``α² dᵀ F d / 2 = target_kl``; returns ‖g‖ and the mean divergence.
+    ``θ ← θ − α d`` with ``(F + c I) d = g`` and ``α² dᵀ F d / 2 = target_kl``; returns ‖g‖ and the mean divergence.
 
     The parameters stay as they are, with a warning, where no such step is found.
     """

@@ -29,7 +29,7 @@ class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
     :param memory: ``"lstm"``, ``"gru"`` (Cho et al., 2014) or ``"rnn"`` (an Elman network, 1990)
     :param lstm_hidden_size: Hidden units of each layer
     :param n_lstm_layers: Number of layers
-    :param enable_critic_lstm: Whether the critic has a memory apart
+    :param enable_critic_lstm: Whether the critic has a separate memory
     :param shared_lstm: Whether the critic reads the actor's memory, without training it
     :param lstm_kwargs: ``bias``, ``dropout``, and ``nonlinearity`` of ``"rnn"``
     """
