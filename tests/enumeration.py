@@ -10,8 +10,8 @@ from itertools import product
 import numpy as np
 import torch as th
 from environments import Tree
+from models import Double, float64
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation import BASELINES
@@ -25,19 +25,11 @@ ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normaliz
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
 
 
-class DoubleExtractor(FlattenExtractor):
-    """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
-
-    def forward(self, observations):
-        return super().forward(observations).double()
-
-
 def make_model(ragged=False, **kwargs):
     arguments = {"gamma": GAMMA, "n_episodes": 2, "normalize_by": "episodes", "discount_scores": True, **kwargs}
-    policy_kwargs = {"net_arch": [], "features_extractor_class": DoubleExtractor}
-    th.set_default_dtype(th.float64)
-    model = REINFORCE("MlpPolicy", Tree(ragged), policy_kwargs=policy_kwargs, device="cpu", **arguments)
-    th.set_default_dtype(th.float32)
+    policy_kwargs = {"net_arch": [], "features_extractor_class": Double}
+    with float64():
+        model = REINFORCE("MlpPolicy", Tree(ragged), policy_kwargs=policy_kwargs, device="cpu", **arguments)
     with th.no_grad():
         model.policy.action_net.weight.copy_(LOGITS.T)
         model.policy.action_net.bias.zero_()

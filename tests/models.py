@@ -1,5 +1,7 @@
 """Both algorithms, small: what is promised of one is promised of the other."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -49,6 +51,23 @@ class OwnPrediction(ActorCriticPolicy):
 
     def _predict(self, observation, deterministic=False):  # type: ignore[no-untyped-def]
         return super()._predict(observation, deterministic)
+
+
+class Double(FlattenExtractor):
+    """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations).double()
+
+
+@contextmanager
+def float64() -> Iterator[None]:
+    """Policies that are made in the block have parameters in float64."""
+    th.set_default_dtype(th.float64)
+    try:
+        yield
+    finally:
+        th.set_default_dtype(th.float32)
 
 
 class Scaled(FlattenExtractor):

@@ -1,9 +1,12 @@
 """Recurrent policies in float64, and what sb3-contrib's own methods say of them, one step at a time."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import torch as th
 from environments import Random
 from gymnasium import spaces
+from models import Double, float64
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
@@ -18,13 +21,6 @@ SPACES = {
     "MultiInputLstmPolicy": spaces.Dict(a=VECTOR, b=spaces.Discrete(3)),
 }
 EXACT = {"rtol": 1e-9, "atol": 1e-10}
-
-
-class Double(FlattenExtractor):
-    """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
-
-    def forward(self, observations):
-        return super().forward(observations).double()
 
 
 class DoubleCombined(CombinedExtractor):
@@ -42,10 +38,8 @@ def make_recurrent(policy="MlpLstmPolicy", env=None, n_envs=2, double=True, poli
     policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [3], **(policy_kwargs or {})}
     policy_kwargs["features_extractor_class"] = extractors[0 if double else 1]
     th.manual_seed(0)
-    if double:
-        th.set_default_dtype(th.float64)
-    model = RecurrentREINFORCE(policy, env, seed=0, device="cpu", policy_kwargs=policy_kwargs, **kwargs)
-    th.set_default_dtype(th.float32)
+    with float64() if double else nullcontext():
+        model = RecurrentREINFORCE(policy, env, seed=0, device="cpu", policy_kwargs=policy_kwargs, **kwargs)
     with th.no_grad():
         for parameter in model.policy.parameters():
             parameter.normal_(std=0.7)

@@ -309,15 +309,25 @@ def test_temperature_may_fall_to_zero(tmp_path):
     assert all(parameter.isfinite().all() for parameter in cold.policy.parameters())
 
 
-def test_min_std_is_a_floor_at_each_step_and_after_a_load(tmp_path):
-    kwargs = {"min_std": 0.6, "learning_rate": 0.5, "policy_kwargs": {"log_std_init": -3.0}}
+@pytest.mark.parametrize("use_sde", [True, False])
+def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
+    low = {"policy_kwargs": {"log_std_init": -3.0}, "use_sde": use_sde}
+    kwargs = {"min_std": 0.6, "learning_rate": 0.5, **low}
     model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=16, **kwargs)
     stds = Record(lambda model: model.policy.log_std.exp().min().item(), at="step")
     model.learn(160, callback=stds)
     assert min(stds.records) >= 0.6 - 1e-6 and model.logger.name_to_value["train/std"] >= 0.6 - 1e-6
-    REINFORCE("MlpPolicy", "Pendulum-v1", policy_kwargs={"log_std_init": -3.0}).save(tmp_path / "model")
+    REINFORCE("MlpPolicy", "Pendulum-v1", **low).save(tmp_path / "model")
     model = REINFORCE.load(tmp_path / "model", env=gym.make("Pendulum-v1"), min_std=0.5, learning_rate=0.0)
-    assert model.learn(32).policy.log_std.exp().item() == pytest.approx(0.5)
+    assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("force_reset", [True, False])
+def test_set_env_resets_on_request(force_reset):
+    model = make("steps", Corridor((7,))).learn(8)
+    model.set_env(model.env, force_reset)
+    rollout = model.learn(8, reset_num_timesteps=False).rollout
+    assert rollout.timesteps[0].tolist() == [0 if force_reset else 1]
 
 
 @pytest.mark.parametrize(("space", "policy"), [(FLAT, "MlpPolicy"), (IMAGE, "CnnPolicy"), (DICT, "MultiInputPolicy")])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
+from environments import Corridor
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
 from models import OwnPrediction, Scaled, plain
@@ -19,6 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.estimation import central_difference
+from sb3_reinforce.estimation.perturbations import default_delta_std
 
 SMALL = dict(n_delta=3, estimator="central", seed=0, device="cpu")
 
@@ -60,6 +62,51 @@ def test_the_gradient_is_the_estimator_applied_to_the_utility():
     expected = central_difference(lambda x: -((x[..., 0] - 3) ** 2) * s_squared[0], theta[None], deltas[:, None])
     th.testing.assert_close(estimate.gradient, expected, rtol=1e-3, atol=1e-4)
     assert float(deltas.std()) < 3 * estimate.delta_std
+
+
+@pytest.mark.parametrize("bound", [None, 0.01])
+@pytest.mark.parametrize("standardize", [True, False])
+def test_the_step_is_the_gradient_scaled_and_clipped(standardize, bound):
+    callback = Record(lambda model: None)
+    model = make(
+        Line(), learning_rate=0.0, delta_std=0.1, standardize_utilities=standardize, max_grad_norm=bound,
+        policy_kwargs={"optimizer_class": th.optim.SGD},
+    ).learn(1, callback)  # fmt: skip
+    estimate = model.estimate_gradient(callback)
+    theta = model.theta
+    model.learning_rate = 1.0
+    model.train(estimate)
+    step = estimate.gradient * (0.1 / estimate.utilities.std(correction=0) if standardize else 1.0)
+    norm = float(step.norm())
+    logged = model.logger.name_to_value
+    assert norm > 0.01 and logged["train/grad_norm"] == pytest.approx(norm, rel=1e-4)
+    assert logged["rollout/utility_mean"] == pytest.approx(float(estimate.utilities.mean()))
+    assert logged["rollout/utility_std"] == pytest.approx(float(estimate.utilities.std(correction=0)))
+    expected = step if bound is None else step * bound / norm
+    th.testing.assert_close(model.theta - theta, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_n_top_uses_the_best_pair():
+    (estimate,) = estimates(1, n_delta=4, n_top=1)
+    utilities, candidates = estimate.utilities.reshape(2, 4), estimate.candidates.reshape(2, 4)
+    best = utilities.amax(0).argmax()
+    plus, minus = utilities[:, best]
+    x, y = candidates[:, best]
+    th.testing.assert_close(estimate.gradient[0], (plus - minus) / (x - y), rtol=1e-6, atol=1e-8)
+
+
+def test_a_utility_is_the_mean_of_its_episodes():
+    (estimate,) = estimates(1, Corridor((1, 9)), n_delta=8, n_eval_episodes=2)
+    assert 5.0 in estimate.utilities and {*estimate.utilities.tolist()} <= {1.0, 5.0, 9.0}
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_candidates_sample_only_on_request(deterministic):
+    """All parameters change alike, which leaves the softmax as it is."""
+    env = Corridor((20,), lambda t, action: float(action))
+    ones = lambda k, n, generator: th.ones(k, n)  # noqa: E731
+    (estimate,) = estimates(1, env, perturbation=ones, deterministic=deterministic)
+    assert (len(estimate.utilities.unique()) == 1) == deterministic
 
 
 @pytest.mark.parametrize("estimator", ["regression", "central", "forward"])
@@ -196,6 +243,11 @@ def test_the_rule_of_thumb():
     assert make(estimator="regression", n_delta=None).n_delta == 2 * n
     assert make(estimator="central", n_delta=None).n_delta == n
     assert make(policy="MlpPolicy", n_delta=None).n_delta == 64
+
+
+def test_perturbations_are_one_percent_of_theta_or_a_twentieth():
+    assert default_delta_std(th.full((4,), 10.0)) == pytest.approx(0.2) and default_delta_std(th.zeros(4)) == 0.05
+    assert make().learn(1).logger.name_to_value["train/delta_std"] == 0.05
 
 
 def test_a_perturbation_and_an_estimator_of_the_user():

@@ -20,11 +20,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.common.tensors import stack, take
+from sb3_reinforce.common.tensors import flatten, stack, take
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines, landscape
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 from sb3_reinforce.recurrent import MlpLstmPolicy, RecurrentREINFORCE
 
 GAMMA = 0.5
@@ -138,24 +139,25 @@ class Ends(Record):
 
 
 @th.no_grad()
-def value_of(policy, episode):
-    """V after a list of observations, by sb3-contrib's own methods."""
+def outputs_of(policy, episode):
+    """The logits and V after a list of observations, by sb3-contrib's own methods."""
     if isinstance(episode[0], dict):
         # A rollout buffer holds a Discrete observation as an array, and the environment returns a number
         episode = [{key: np.ravel(part) for key, part in obs.items()} for obs in episode]
     obs = stack(episode)
     obs = {key: part[:, None] for key, part in obs.items()} if isinstance(obs, dict) else obs[:, None]
-    return float(by_steps(policy, obs, np.zeros((len(episode), 1), dtype=bool), policy.zero_state(1))[1][-1])
+    logits, values = by_steps(policy, obs, np.zeros((len(episode), 1), dtype=bool), policy.zero_state(1))
+    return logits[-1], float(values[-1])
 
 
 @pytest.mark.parametrize("name", SPACES)
 @pytest.mark.parametrize("truncate", [False, True])
 @pytest.mark.parametrize("n_steps", [4, None])
-def test_values_are_those_of_one_step_at_a_time(n_steps, truncate, name):
+def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
     """Also after time limits, and where a rollout cuts an episode that began in one before."""
     env = make_vec_env(lambda: Random(SPACES[name], lengths=(2, 5, 9), truncate=truncate), 2, seed=0)
     model = make_recurrent(name, env, n_steps=n_steps, n_episodes=None if n_steps else 4, learning_rate=0.0)
-    records = Record(lambda model: (model.rollout, model._last_obs))
+    records = Record(lambda model: (model.rollout, model._last_obs, model.rollout_buffer.log_probs.copy()))
     values = []
     evaluate_critic = model._evaluate_critic
     model._evaluate_critic = lambda *args: values.append(evaluate_critic(*args)) or values[-1]
@@ -163,17 +165,23 @@ def test_values_are_those_of_one_step_at_a_time(n_steps, truncate, name):
     model.learn(40, [records, ends])
     first = 0
     running = [[], []]
-    for (rollout, last_obs), (own, own_next) in zip(records.records, values, strict=True):
+    for (rollout, last_obs, log_probs), (own, own_next) in zip(records.records, values, strict=True):
+        # The actor's steps and the sequences of training have one log π
+        actions = rollout.actions.flatten().long()
+        trained_on, _ = log_prob_and_entropy(model.policy, flatten(rollout.inputs), actions)
+        np.testing.assert_allclose(trained_on.detach(), log_probs.ravel(), atol=1e-6)
         for t, env in product(range(len(rollout.dones)), range(2)):
             running[env].append(take(rollout.observations, (t, env)))
-            assert own[t, env] == pytest.approx(value_of(model.policy, running[env]), abs=1e-6)
+            logits, value = outputs_of(model.policy, running[env])
+            assert own[t, env] == pytest.approx(value, abs=1e-6)
+            assert log_probs[t, env] == pytest.approx(float(logits[int(rollout.actions[t, env])]), abs=1e-6)
             is_last = bool(rollout.dones[t, env])
             if is_last:
                 following = ends.found[first + t, env]
             else:
                 after = take(rollout.observations, t + 1) if t + 1 < len(rollout.dones) else last_obs
                 following = take(after, env)
-            expected = 0.0 if following is None else value_of(model.policy, [*running[env], following])
+            expected = 0.0 if following is None else outputs_of(model.policy, [*running[env], following])[1]
             if rollout.used[t, env]:
                 assert own_next[t, env] == pytest.approx(expected, abs=1e-6)
             if is_last:
@@ -181,6 +189,23 @@ def test_values_are_those_of_one_step_at_a_time(n_steps, truncate, name):
         first += len(rollout.dones)
         if n_steps is None:
             running = [[], []]
+
+
+def test_the_default_rollouts():
+    models = [REINFORCE("MlpPolicy", "CartPole-v1", baseline=name, device="cpu") for name in ("value", "mean")]
+    models.append(RecurrentREINFORCE("MlpLstmPolicy", "CartPole-v1", device="cpu"))
+    assert [(model.n_steps, model.n_episodes) for model in models] == [(32, None), (None, 16), (None, 16)]
+
+
+def test_the_critics_minibatches_are_whole_sequences():
+    model = make_recurrent(n_steps=40, batch_size=10, double=False)
+    values = model.policy.sequence_values
+    asked = []
+    model.policy.sequence_values = lambda rows: asked.append(rows["sequence"]) or values(rows)
+    whole = th.bincount(model.learn(80).rollout.episodes.flatten())
+    parts = [each for each in asked if len(each) < 80]
+    assert len(parts) > 4
+    assert all(th.equal(th.bincount(each, minlength=len(whole))[each], whole[each]) for each in parts)
 
 
 @pytest.mark.parametrize("n_steps", [8, None])
@@ -219,7 +244,7 @@ def test_the_lab_takes_it(network):
     table = check_gradient(model)
     assert table.passed, str(table)
     assert len(compare_baselines(model, n_episodes=4, n_resamples=50)) >= 5
-    assert RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
+    RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
 
 
 class OneStep(MlpLstmPolicy):

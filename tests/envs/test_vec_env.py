@@ -160,6 +160,8 @@ def test_attributes_and_methods_where_the_environment_can():
     assert env.get_attr("lengths") == [(4, 7)] * N_ENVS and callable(env.get_attr("observe")[0])
     assert len(env.env_method("observe")) == N_ENVS and len(env.env_method("observe", indices=[2])) == 1
     assert env.env_is_wrapped(gym.Wrapper) == [False] * N_ENVS and env.has_attr("lengths")
+    wrapped = synced(lambda: gym.wrappers.TimeLimit(Corridor(), 9))
+    assert wrapped.env_is_wrapped(gym.wrappers.TimeLimit, indices=[0, 2]) == [True, True]
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("truncate", True, indices=[0])
     assert native().get_attr("max_episode_steps") == [500] * N_ENVS

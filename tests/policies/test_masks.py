@@ -12,7 +12,7 @@ from enumeration import make_model as make_unmasked
 from environments import Random, Tree
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from models import plain
+from models import Double, float64, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -202,20 +202,14 @@ class MaskedTree(Tree):
         return found
 
 
-class Double(FlattenExtractor):
-    def forward(self, observations):
-        return super().forward(observations).double()
-
-
 @pytest.mark.parametrize("ragged", [True, False])
 @pytest.mark.parametrize("baseline", ["none", "leave_one_out", "optimal"])
 def test_the_expected_gradient_is_that_of_the_expected_return(baseline, ragged):
     """By enumeration, with the package's weights and scores; log π of a trajectory and ∇E[G_0] by hand."""
     tree, n_episodes = MaskedTree(ragged), 3 if baseline == "optimal" else 2
-    th.set_default_dtype(th.float64)
     policy_kwargs = {"net_arch": [], "features_extractor_class": Double}
-    policy = make("episodes", ActionMaskObservation(tree), policy_kwargs=policy_kwargs).policy
-    th.set_default_dtype(th.float32)
+    with float64():
+        policy = make("episodes", ActionMaskObservation(tree), policy_kwargs=policy_kwargs).policy
     weight, bias = parameters = [*policy.action_net.parameters()]
     with th.no_grad():
         weight.normal_()
