@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient
@@ -17,6 +18,7 @@ from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
 from sb3_reinforce.envs.guards import guarded
+from sb3_reinforce.envs.starts import separate
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
     Estimator,
@@ -33,6 +35,7 @@ from sb3_reinforce.estimation.perturbations import (
     new_generator,
 )
 from sb3_reinforce.policies import parameters
+from sb3_reinforce.policies.evaluation import trainable
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.sampling.normalization import frozen
@@ -189,10 +192,10 @@ class FiniteDifference(BasePolicyGradient):
 
     def _find_parameters(self) -> list[th.nn.Parameter]:
         """The actor's trainable parameters, found by a pass that is made again only if others are trainable now."""
-        trainable = [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
-        if list(map(id, trainable)) != list(map(id, self._trainable)):
-            self._searched = parameters.actor_parameters(self.policy)
-            self._trainable = trainable
+        present = trainable(self.policy)
+        if list(map(id, present)) != list(map(id, self._trainable)):
+            self._searched = parameters.searched_parameters(self.policy)
+            self._trainable = present
         return self._searched
 
     @guarded
@@ -233,16 +236,18 @@ class FiniteDifference(BasePolicyGradient):
             )
         callback.on_training_start(locals(), globals())
         iteration = 0
-        while self.num_timesteps < total_timesteps:
-            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            try:
-                estimate = self.estimate_gradient(callback)
-            except Stopped:
-                break
-            self.train(estimate)
-            iteration += 1
-            if log_interval is not None and iteration % log_interval == 0:
-                self.dump_logs(iteration)
+        try:
+            while self.num_timesteps < total_timesteps:
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+                self.train(self.estimate_gradient(callback))
+                iteration += 1
+                if log_interval is not None and iteration % log_interval == 0:
+                    self.dump_logs(iteration)
+        except Stopped:
+            pass
+        finally:
+            if self.common_random_numbers:
+                separate(cast(VecEnv, self.env))
         callback.on_training_end()
         return self
 

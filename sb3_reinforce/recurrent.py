@@ -141,7 +141,7 @@ class RecurrentREINFORCE(REINFORCE):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_actor"]
+        return [*super()._excluded_save_params(), "_actor", "_state"]
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None
@@ -158,7 +158,7 @@ class RecurrentREINFORCE(REINFORCE):
         """
         self._actor = None
         is_complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        self._next_state = self._state_after_rollout() if is_complete and n_rollout_steps is not None else None
+        self._next_state = self._state_after_rollout().cpu() if is_complete and n_rollout_steps is not None else None
         return is_complete
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
@@ -170,7 +170,7 @@ class RecurrentREINFORCE(REINFORCE):
             starts = th.as_tensor(self._episode_starts(), device=self.device)
             self._state = None
             if self._next_state is not None and not starts.all():
-                self._state = self._next_state[: self.n_envs] * ~starts[(...,) + (None,) * 4]
+                self._state = self._next_state[: self.n_envs].to(self.device) * ~starts[(...,) + (None,) * 4]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
         self._actor = make_recurrent_actor(policy, state, self._episode_starts, with_log_prob)
         return self._actor
@@ -196,7 +196,7 @@ class RecurrentREINFORCE(REINFORCE):
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
         if state is not None and self._next_state is not None:
             goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
-            state[:, 1] = self._next_state[: len(state), 1] * goes_on[(...,) + (None,) * 3]
+            state[:, 1] = self._next_state[: len(state), 1].to(self.device) * goes_on[(...,) + (None,) * 3]
         rows = rows_of(obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), state)
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T

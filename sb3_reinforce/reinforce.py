@@ -30,7 +30,7 @@ from sb3_reinforce.common.settings import (
     check_starts,
 )
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import start_groups
+from sb3_reinforce.envs.starts import separate, start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -43,6 +43,7 @@ from sb3_reinforce.policies.evaluation import (
     sampled_divergence,
     set_temperature,
     split_parameters,
+    trainable,
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
@@ -265,14 +266,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
         """What log π depends on, what only V depends on, and what both do; sorted again if the policy has changed."""
         if rollout.values is None:
-            return [parameter for parameter in self.policy.parameters() if parameter.requires_grad], [], []
-        trainable = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
-        if self._sorted_parameters[:1] != (trainable,):
+            return trainable(self.policy), [], []
+        present = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
+        if self._sorted_parameters[:1] != (present,):
             held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
-            if not held >= {number for number, _ in trainable}:
+            if not held >= {number for number, _ in present}:
                 self._make_critic_optimizer()
             self.policy.set_training_mode(False)
-            self._sorted_parameters = (trainable, split_parameters(self.policy, batch.observations, batch.actions))
+            self._sorted_parameters = (present, split_parameters(self.policy, batch.observations, batch.actions))
         groups: tuple[Parameters, Parameters, Parameters] = self._sorted_parameters[1]
         return groups
 
@@ -500,6 +501,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         model.n_episodes = n_episodes
         model.episodes_per_start = 1
         model.baseline = baseline or ("value" if self.has_critic else "none")
+        if not model.has_critic:
+            # λ weights values, and there are none
+            model.gae_lambda = 1.0
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)
@@ -537,7 +541,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        try:
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
+        finally:
+            if self.episodes_per_start > 1:
+                separate(cast(VecEnv, self.env))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)

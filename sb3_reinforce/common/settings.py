@@ -162,8 +162,8 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
-    if model.n_episodes == 1 and model.baseline in ("leave_one_out", "optimal"):
-        reason = f"baseline={model.baseline!r}, which is computed from the other episodes"
+    if model.n_episodes == 1 and model.baseline in ("time_mean", "leave_one_out", "optimal"):
+        reason = f"baseline={model.baseline!r}, which compares episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
         got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"

@@ -13,7 +13,7 @@ from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_t
 from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resamples
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline, ratio_of_others
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, parameters_of
 from sb3_reinforce.estimation.weights import check_baseline
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -190,7 +190,7 @@ def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> tuple[dict
 
 def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
     """``gradients_by_episode`` in blocks ``(k, m, c)`` of c components of θ, at most ``floats`` numbers each."""
-    n_parameters = sum(parameter.numel() for parameter in scored_parameters(rollout))
+    n_parameters = sum(parameter.numel() for parameter in parameters_of(rollout))
     n_columns = max(1, floats // (len(weights) * len(th.unique(rollout.episodes[rollout.used]))))
     for start in range(0, n_parameters, n_columns):
         yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))

@@ -18,9 +18,9 @@ from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, train
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import scored_parameters
+from sb3_reinforce.estimation.scores import parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature, temperature_of
+from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature, temperature_of, trainable
 
 
 class Diagnosis(BaseCallback):
@@ -108,7 +108,7 @@ class GradientQualityCallback(Diagnosis):
             return
         is_search = isinstance(self.model, FiniteDifference)
         try:
-            theta = self.model.theta if is_search else to_vector(scored_parameters(self.model.rollout))
+            theta = self.model.theta if is_search else to_vector(parameters_of(self.model.rollout))
         except ValueError:
             # The actor is frozen
             return
@@ -189,9 +189,8 @@ class PitfallCallback(Diagnosis):
         self.log_prob = log_prob.detach()
         self.gradient = th.zeros(0)
         if log_prob.requires_grad:
-            parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
             weights = select(training_weights(self.model), is_first).to(log_prob)
-            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
+            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), trainable(policy), allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
 
     def _on_rollout_start(self) -> None:

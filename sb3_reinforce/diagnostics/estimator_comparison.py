@@ -12,12 +12,13 @@ from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
+from sb3_reinforce.envs.starts import separate
 from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.estimators import ESTIMATORS
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
-from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.parameters import actor_parameters
+from sb3_reinforce.policies.parameters import searched_parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import undisturbed
 
@@ -113,7 +114,7 @@ def compare_estimators(
                 n_steps = utility.n_steps - n_steps_before
             seconds = (time.perf_counter() - begin) / len(gradients)
             steps = n_steps / len(gradients)
-            to_reference, snr = judge(gradients, reference, n_resamples, confidence, seed)
+            to_reference, snr = compare_to_reference(gradients, reference, n_resamples, confidence, seed)
             snr_per_step = Estimate(snr.value / steps, snr.low / steps, snr.high / steps)
             rows.append(EstimatorRow(name, to_reference, snr_per_step, steps, seconds))
     legend = {
@@ -126,7 +127,7 @@ def compare_estimators(
     return Table(f"Gradient of U(θ) for {n_parameters} parameters by estimator", rows, legend)
 
 
-def judge(
+def compare_to_reference(
     gradients: th.Tensor, reference: th.Tensor, n_resamples: int, confidence: float, seed: int
 ) -> tuple[Estimate, Estimate]:
     """Cosine of estimates ``(m, n)`` to other gradients ``(m', n)``, and the signal-to-noise ratio of one estimate."""
@@ -146,17 +147,16 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     """
     collector = as_reinforce(model).sampling_copy(n_episodes, "none")
     collector.gamma = 1.0
-    collector.gae_lambda = 1.0
     collector.reward_to_go = True
     collector.discount_scores = False
     collector.max_episode_steps = model.max_episode_steps
     with undisturbed(model):
-        env_of(model).seed(int(th.randint(2**31, ())))
+        separate(env_of(model))
         rollout = collect_episodes(collector)
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
-    wanted = {id(parameter) for parameter in actor_parameters(rollout.policy)}
-    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in scored_parameters(rollout)])
+    wanted = {id(parameter) for parameter in searched_parameters(rollout.policy)}
+    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in parameters_of(rollout)])
     return gradients[:, mask], rollout.dones.numel()
 
 

@@ -21,7 +21,7 @@ from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, se
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import gradients_by_episode, scored_parameters
+from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.estimation.weights import by_step
 from sb3_reinforce.policies.evaluation import log_prob_and_entropy
 from sb3_reinforce.policies.sequences import RecurrentPolicy
@@ -118,7 +118,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     with undisturbed(model):
         rollout = collect_episodes(collector)
     policy = rollout.policy
-    scored_parameters(rollout)
+    parameters_of(rollout)
     obs = select(rollout.inputs, rollout.used)
     actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
     some_obs, some_actions = spread(policy, obs, actions)
@@ -175,10 +175,10 @@ def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """The step of ``train()``, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π / denominator``."""
+    """A step of ``train()`` by SGD, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π / denominator``."""
     gradients = gradients_by_episode(rollout, training_weights(collector))[0]
     expected = gradients.sum(0) / rollout.denominator
-    parameters = scored_parameters(rollout)
+    parameters = parameters_of(rollout)
     before = to_vector(parameters)
     # As long as θ if the gradient is shorter: a short step would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
@@ -186,6 +186,7 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     collector.lr_schedule = FloatSchedule(rate)
     # Without values no critic is trained
     collector.rollout = replace(rollout, values=None)
+    collector.step = "optimizer"
     collector.ent_coef = 0.0
     collector.max_grad_norm = None  # type: ignore[assignment]
     collector.min_std = 0.0

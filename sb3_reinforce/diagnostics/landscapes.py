@@ -13,9 +13,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
 from sb3_reinforce.diagnostics.sampling import env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
-from sb3_reinforce.policies.parameters import actor_parameters, read
+from sb3_reinforce.policies.parameters import read, searched_parameters
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
-from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
+from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
 from sb3_reinforce.sampling.measurement import undisturbed
 
 
@@ -23,8 +23,8 @@ class CandidateUtility:
     """
     ``U(θ) = E[Σ_t r_t]`` of parameter vectors: the mean return of episodes in a model's environments.
 
-    The policy samples its actions, so this is the utility whose gradient REINFORCE estimates at γ = 1. All candidates
-    of a call start from the same seeds; every call uses new ones.
+    The policy samples its actions, so this is the utility whose gradient REINFORCE estimates at γ = 1. Candidates
+    share their seeds as in FiniteDifference; every call uses new ones.
 
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility
@@ -44,7 +44,7 @@ class CandidateUtility:
         #: A bar of tqdm that counts episodes, or None
         self.bar: Any = None
         policy = cast(ActorCriticPolicy, model.policy)
-        self.parameters = actor_parameters(policy)
+        self.parameters = searched_parameters(policy)
         self.theta = read(self.parameters)
         self.actor = make_candidate_actor(policy, self.parameters, self.env.num_envs, deterministic=False)
 
@@ -57,8 +57,8 @@ class CandidateUtility:
         :raises ValueError: If a number is not finite, or an episode does not end
         """
         candidates = thetas.reshape(-1, len(self.theta))
-        seeds = np.broadcast_to(self.seed + np.arange(self.n_episodes), (len(candidates), self.n_episodes))
-        self.seed += self.n_episodes
+        seeds = seeds_of(thetas.shape, self.n_episodes, self.seed)
+        self.seed = int(seeds.max()) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)

@@ -13,11 +13,14 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
-from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy, trainable
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
+# Random directions in which scores are compared with differences, and observations at which a sign is checked
+N_DIRECTIONS = 16
+N_ACTIONS = 8
 
 
 def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
@@ -55,14 +58,14 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
     return as_policy_actions(drawn.reshape(len(drawn), -1), policy.action_space)
 
 
-def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, n_directions: int = 16) -> float:
+def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
     Relative error of ``⟨∇L, u⟩`` against ``(L(θ + h u) − L(θ − h u)) / 2h`` over random directions u, for the best h.
 
     ``L = Σ ± log π(a_t|s_t)`` with random signs. Where log π is strongly curved, only a short h is accurate; a wrong
     gradient is wrong for every h.
     """
-    parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    parameters = trainable(policy)
     signs = 2.0 * th.randint(2, (len(actions),)).to(actions.device) - 1
 
     def objective() -> th.Tensor:
@@ -70,7 +73,7 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor, 
 
     gradient = to_vector(th.autograd.grad(objective(), parameters, allow_unused=True, materialize_grads=True)).double()
     theta = to_vector(parameters)
-    directions = th.nn.functional.normalize(th.randn(n_directions, len(theta), device=theta.device))
+    directions = th.nn.functional.normalize(th.randn(N_DIRECTIONS, len(theta), device=theta.device))
     errors = []
     # In float32 the rounding of log π and the third derivative usually balance near eps^(1/3), the first h
     for h in (5e-3, 5e-4, 5e-5):
@@ -93,7 +96,7 @@ def values_at(thetas: th.Tensor, parameters: Parameters, function: Callable[[], 
     return th.stack(values)
 
 
-def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int, n_actions: int = 8) -> float:
+def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
     """
     The fraction of sampled actions that are less likely after a step along their own score, ``θ + h ∇ log π(a|s)``.
 
@@ -102,7 +105,7 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int, n_actions
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     wrong = []
-    for index in th.randperm(n_obs)[:n_actions]:
+    for index in th.randperm(n_obs)[:N_ACTIONS]:
         one = take(obs, index[None])
         draws = draw(policy, one, n_draws)
         # The effect of a step is clearest for the action that is farthest from the rest

@@ -13,17 +13,16 @@ from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
-from sb3_reinforce.envs.starts import check_groups
+from sb3_reinforce.envs.starts import check_groups, separate
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
+from sb3_reinforce.estimation.weights import ROUNDING
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import start_from, undisturbed
 
 # Sizes of groups to predict, and episodes per start
 SIZES = (2, 4, 8)
 N_PER_START = SIZES[-1]
-# What is smaller, relative to the largest return, is rounding
-ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,8 @@ def compare_starts(
     with seeded(model.policy, seed):
         rollouts = sample_starts(model, n_starts, progress_bar)
         # G_t and m_t, (n_steps, n_starts, N_PER_START)
-        returns = side_by_side([rollout.returns * rollout.used for rollout in rollouts])
-        used = side_by_side([rollout.used.double() for rollout in rollouts])
+        returns = by_start([rollout.returns * rollout.used for rollout in rollouts])
+        used = by_start([rollout.used.double() for rollout in rollouts])
         grams = gram_matrices(rollouts, returns, used)
     single = variance(compute_moments(grams[1], counts))
     # The mean of N/m independent groups: tr Σ_m / (N/m), against tr Σ_1 / N
@@ -92,7 +91,6 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
     """Rollouts of one episode per environment, which play ``N_PER_START`` episodes of each start in turn."""
     env = env_of(model)
     collector = model.sampling_copy(env.num_envs, "none")
-    collector.gae_lambda = 1.0
     seeds = th.randint(2**31, (n_starts,)).numpy().repeat(N_PER_START)
     rollouts = []
     firsts = []
@@ -102,13 +100,12 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
         for part in seeds.reshape(-1, env.num_envs):
             firsts.append(start_from(collector, part))
             rollouts.append(collect_episodes(collector, bar))
-        # Environments that have shared a start would go on with the same random numbers
-        env.seed(int(th.randint(2**31, ())))
+        separate(env)
         check_groups(stack([take(obs, i) for obs in firsts for i in range(env.num_envs)]), N_PER_START)
     return rollouts
 
 
-def side_by_side(parts: list[th.Tensor]) -> th.Tensor:
+def by_start(parts: list[th.Tensor]) -> th.Tensor:
     """Rows ``(n_steps, n_envs)`` of all rollouts, with zeros behind their end, by start: ``(n_steps, n_starts, k)``."""
     padded = pad_sequence(parts)
     return padded.reshape(len(padded), -1, N_PER_START)

@@ -38,6 +38,11 @@ def start_groups(env: VecEnv, size: int) -> Any:
     return obs
 
 
+def separate(env: VecEnv) -> None:
+    """Give environments that have shared a start different random numbers again, from their next reset on."""
+    env.seed(int(th.randint(2**31, ())))
+
+
 def are_alike(obs: Any, size: int) -> bool:
     """Whether the observations of each ``size`` neighbours are equal."""
     parts = obs.values() if isinstance(obs, dict) else [obs]

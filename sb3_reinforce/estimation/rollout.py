@@ -1,6 +1,7 @@
 """What was collected: the rollout that baselines read, and which of its steps belong to which episode."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ class Rollout:
     state: th.Tensor | None = None
     episodes_per_start: int = 1
 
-    @property
+    @cached_property
     def episodes(self) -> th.Tensor:
         """The number of the episode that each step belongs to, from 0 on, shape ``(n_steps, n_envs)``, int64."""
         return episode_numbers(self.dones)

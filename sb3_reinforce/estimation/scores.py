@@ -20,8 +20,14 @@ from torch.nn import functional as F
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten, select, take, to_vector
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.policies.evaluation import Parameters, depends_on, extract_features, log_prob_and_entropy
-from sb3_reinforce.policies.plain_mlp import divide, plain_actor
+from sb3_reinforce.policies.evaluation import (
+    Parameters,
+    actor_parameters,
+    extract_features,
+    log_prob_and_entropy,
+    trainable,
+)
+from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
 # Floats that an intermediate result may take, 128 MiB in float32
 CHUNK = 2**25
@@ -32,6 +38,8 @@ STEPS = 4096
 Factors: TypeAlias = tuple[th.Tensor, th.Tensor]
 
 
+# cuDNN cannot differentiate the passes of a recurrent policy in evaluation mode
+@th.backends.cudnn.flags(enabled=False)
 def gradients_by_episode(
     rollout: Rollout, *weights: th.Tensor, chunk: int = CHUNK, columns: slice = slice(None)
 ) -> th.Tensor:
@@ -47,43 +55,57 @@ def gradients_by_episode(
     :return: Shape ``(k, m, n)``
     :raises ValueError: If log π does not depend on any parameter in a way that can be differentiated
     """
-    parameters = scored_parameters(rollout)
+    parameters = parameters_of(rollout)
     w = th.stack([select(weight, rollout.used) for weight in weights]).to(parameters[0])
-    _, rank = th.unique(rollout.episodes[rollout.used], return_inverse=True)
+    _, episode = th.unique(rollout.episodes[rollout.used], return_inverse=True)
     n = len(range(sum(parameter.numel() for parameter in parameters))[columns])
-    result = w.new_zeros(len(w), int(rank.max()) + 1, n)
-    for episode, gradients in episode_sums(rollout, parameters, w, rank, chunk):
-        result[:, episode] += gradients[:, columns]
+    result = w.new_zeros(len(w), int(episode.max()) + 1, n)
+    layers = factored_layers(rollout.policy)
+    if layers is None:
+        sums = sums_by_backward_passes(rollout, parameters, w, episode)
+    else:
+        sums = sums_by_factors(rollout, parameters, layers, w, episode, chunk)
+    for number, gradients in sums:
+        result[:, number] += gradients[:, columns]
     return result
 
 
-def episode_sums(
-    rollout: Rollout, parameters: Parameters, w: th.Tensor, rank: th.Tensor, chunk: int
+def sums_by_factors(
+    rollout: Rollout, parameters: Parameters, layers: list[nn.Module], w: th.Tensor, episode: th.Tensor, chunk: int
 ) -> Iterator[tuple[int, th.Tensor]]:
-    """Episodes, each with ``Σ_t w_t ∇ log π`` over some of its steps, shape ``(k, n)``, for k weights of all steps."""
+    """``Σ_t w_t ∇ log π`` over some steps of an episode, shape ``(k, n)``, from the factors of the scores."""
     policy = rollout.policy
-    obs = select(rollout.inputs, rollout.used)
-    actions = as_policy_actions(select(rollout.actions, rollout.used), policy.action_space)
-    layers = factored_layers(policy)
-    if layers is None:
-        for episode, steps in enumerate(steps_of(rank)):
-            log_prob, _ = log_prob_and_entropy(policy, take(obs, steps), actions[steps])
-            yield episode, th.stack([vector_jacobian_product(log_prob, parameters, part) for part in w[:, steps]])
-        return
+    obs, actions = used_inputs(rollout)
     features = extract_features(policy, obs, policy.pi_features_extractor).detach()
     widest = max(parameter.shape[0] for parameter in parameters)
     n_at_once = max(1, min(STEPS, chunk // (len(w) * widest)))
-    rank, order = rank.sort(stable=True)
-    for steps, ranks in zip(th.split(order, n_at_once), th.split(rank, n_at_once), strict=True):
+    episode, order = episode.sort(stable=True)
+    for steps, episodes in zip(th.split(order, n_at_once), th.split(episode, n_at_once), strict=True):
         factors = score_factors(policy, layers, features[steps], actions[steps])
-        for episode, part in zip(th.unique(ranks).tolist(), steps_of(ranks), strict=True):
+        for number, part in zip(th.unique(episodes).tolist(), steps_of(episodes), strict=True):
             weights = w[:, steps[part]]
             # Σ_t w_t δ_t x_tᵀ
             sums = [
                 ((weights[:, None] * delta[part].T) @ x[part]).flatten(1)
                 for delta, x in (factors[parameter] for parameter in parameters)
             ]
-            yield episode, th.cat(sums, dim=1)
+            yield number, th.cat(sums, dim=1)
+
+
+def sums_by_backward_passes(
+    rollout: Rollout, parameters: Parameters, w: th.Tensor, episode: th.Tensor
+) -> Iterator[tuple[int, th.Tensor]]:
+    """``Σ_t w_t ∇ log π`` over all steps of an episode, shape ``(k, n)``, by a backward pass for each of k weights."""
+    obs, actions = used_inputs(rollout)
+    for number, steps in enumerate(steps_of(episode)):
+        log_prob, _ = log_prob_and_entropy(rollout.policy, take(obs, steps), actions[steps])
+        yield number, th.stack([vector_jacobian_product(log_prob, parameters, part) for part in w[:, steps]])
+
+
+def used_inputs(rollout: Rollout) -> tuple[PyTorchObs, th.Tensor]:
+    """The observations and actions of the used steps in a row."""
+    actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
+    return select(rollout.inputs, rollout.used), actions
 
 
 def vector_jacobian_product(log_prob: th.Tensor, parameters: Parameters, w: th.Tensor) -> th.Tensor:
@@ -91,25 +113,24 @@ def vector_jacobian_product(log_prob: th.Tensor, parameters: Parameters, w: th.T
     return to_vector(th.autograd.grad(log_prob, parameters, w.to(log_prob), retain_graph=True, materialize_grads=True))
 
 
-def steps_of(rank: th.Tensor) -> Iterator[th.Tensor]:
-    """The steps of each episode, in the order of the episodes' ranks."""
-    lengths = th.unique(rank, return_counts=True)[1]
-    return iter(th.split(rank.argsort(stable=True), lengths.tolist()))
+def steps_of(episode: th.Tensor) -> Iterator[th.Tensor]:
+    """The steps of each episode, in the order of the episodes' numbers."""
+    lengths = th.unique(episode, return_counts=True)[1]
+    return iter(th.split(episode.argsort(stable=True), lengths.tolist()))
 
 
 def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that log π depends on, in the order of ``policy.parameters()``."""
-    parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
-    depends = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
-    if not any(depends):
+    parameters = actor_parameters(policy, obs, actions)
+    if not parameters:
         raise ValueError(
             f"log π of {type(policy).__name__} cannot be differentiated: it depends on none of the policy's "
-            f"{len(parameters)} trainable parameters (is it computed under no_grad, or detached?)"
+            f"{len(trainable(policy))} trainable parameters (is it computed under no_grad, or detached?)"
         )
-    return [parameter for parameter, used in zip(parameters, depends, strict=True) if used]
+    return parameters
 
 
-def scored_parameters(rollout: Rollout) -> Parameters:
+def parameters_of(rollout: Rollout) -> Parameters:
     """``score_parameters`` of the policy that made a rollout, from its first step."""
     first = th.arange(1)
     actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
@@ -132,18 +153,8 @@ def score_factors(
 ) -> dict[th.Tensor, Factors]:
     """The factors of the score of ``n`` steps with features x, for each parameter of a plain actor."""
     ones = x.new_ones(len(x), 1)
-    inputs, outputs = [], []
     with th.enable_grad():
-        # Gradients flow to the outputs of all layers, of frozen ones too
-        x.requires_grad_()
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                inputs.append(x.detach())
-                x = F.linear(x, layer.weight, layer.bias)
-                outputs.append(x)
-            else:
-                x = layer(x)
-        logits = divide(layers[-1], x)
+        inputs, outputs, logits = trace(layers, x)
         log_std = []
         if isinstance(policy.action_dist, DiagGaussianDistribution):
             log_std = [policy.log_std.detach().expand_as(logits).clone().requires_grad_()]
@@ -159,3 +170,18 @@ def score_factors(
         # One log_std may serve several actions
         factors[policy.log_std] = (deltas[-1].sum_to_size(len(actions), *policy.log_std.shape), ones)
     return factors
+
+
+def trace(layers: list[nn.Module], x: th.Tensor) -> tuple[list[th.Tensor], list[th.Tensor], th.Tensor]:
+    """The inputs x and the outputs z of the linear layers of a plain actor, and its logits or means."""
+    inputs, outputs = [], []
+    # Gradients flow to the outputs of all layers, of frozen ones too
+    x.requires_grad_()
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            inputs.append(x.detach())
+            x = F.linear(x, layer.weight, layer.bias)
+            outputs.append(x)
+        else:
+            x = layer(x)
+    return inputs, outputs, apply_temperature(layers[-1], x)

@@ -17,7 +17,7 @@ from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
 from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
 
-# Advantages of less than this part of the return are rounding errors
+# Differences between returns of less than this part of them are rounding errors
 ROUNDING = 1e-12
 
 
@@ -45,14 +45,7 @@ def complete_rollout(
     """
     rewards = buffer.rewards
     timesteps = timesteps_of(dones, running.timesteps)
-    # m_t = 1 where G_t is known
-    used = np.ones_like(dones) if next_values is not None else in_finished_episode(dones)
-    if quota is None:
-        check_used(used)
-        denominator = used.size
-    else:
-        used = used & within_quota(dones, quota)
-        denominator = int(used.sum() if normalize_by == "steps" else quota.sum())
+    used, denominator = used_steps(dones, quota, normalize_by, has_critic=next_values is not None)
     returns_to_go = lambda_return(rewards, dones, 0.0 if next_values is None else next_values, gamma, gae_lambda)
     returns = returns_to_go if reward_to_go else total_return(returns_to_go, timesteps, gamma, running.rewards)
     # The total return has γ^t already
@@ -76,6 +69,16 @@ def complete_rollout(
     buffer.advantages = compute_advantages(rollout, baseline(rollout))
     buffer.returns = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
     return rollout
+
+
+def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_critic: bool) -> tuple[Bools, int]:
+    """m_t, which is 1 where G_t is known and the step is in the quota, and the denominator D."""
+    used = np.ones_like(dones) if has_critic else in_finished_episode(dones)
+    if quota is None:
+        check_used(used)
+        return used, used.size
+    used = used & within_quota(dones, quota)
+    return used, int(used.sum() if normalize_by == "steps" else quota.sum())
 
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:

@@ -153,6 +153,8 @@ def sampled_divergence(
     return float((th.expm1(log_ratio) - log_ratio).mean())
 
 
+# cuDNN cannot differentiate the passes of a recurrent policy in evaluation mode
+@th.backends.cudnn.flags(enabled=False)
 def split_parameters(
     policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
 ) -> tuple[Parameters, Parameters, Parameters]:
@@ -162,7 +164,7 @@ def split_parameters(
     They are read from the graph and not from their names. The third list (a shared features extractor) is part of the
     first.
     """
-    parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    parameters = trainable(policy)
     in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
     route = route_of(policy, with_critic=True)
     values = evaluate(policy, route, obs, actions, with_values=True)[2]
@@ -173,6 +175,18 @@ def split_parameters(
         [parameter for parameter, actor, critic in table if critic and not actor],
         [parameter for parameter, actor, critic in table if critic and actor],
     )
+
+
+def trainable(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
+    """The parameters that are trained, in the policy's order."""
+    return [parameter for parameter in policy.parameters() if parameter.requires_grad]
+
+
+def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> list[th.nn.Parameter]:
+    """The trainable parameters that log π depends on, in the policy's order."""
+    parameters = trainable(policy)
+    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
+    return [parameter for parameter, is_in_actor in zip(parameters, in_actor, strict=True) if is_in_actor]
 
 
 def depends_on(output: th.Tensor, parameters: Parameters) -> list[bool]:

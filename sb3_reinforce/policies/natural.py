@@ -54,12 +54,12 @@ def natural_step(
     if norm == 0 or target_kl == 0:
         return norm, 0.0
     divergence = divergence_from_now(policy, obs)
-    fisher_product = hessian_product(divergence(), parameters)
+    fisher_product = hessian_vector_product(divergence(), parameters)
     d = conjugate_gradients(lambda v: fisher_product(v) + damping * v, g / norm)
     curvature = float(d @ fisher_product(d))
     kl = None
     if 0 < curvature < math.inf:
-        kl = walk(parameters, d, math.sqrt(2 * target_kl / curvature), divergence, target_kl)
+        kl = line_search(parameters, d, math.sqrt(2 * target_kl / curvature), divergence, target_kl)
     if kl is None:
         warnings.warn(
             "The natural step is left out, and the parameters are those before it: no step was found that changes the "
@@ -94,7 +94,7 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
     return divergence
 
 
-def hessian_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
+def hessian_vector_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
     """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994)."""
     slopes = th.autograd.grad(output, parameters, create_graph=True)
     slope = th.cat([each.flatten() for each in slopes])
@@ -110,19 +110,19 @@ def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor)
     for _ in range(N_ITERATIONS):
         if square <= PRECISION**2 * (b @ b):
             break
-        image = product(direction)
-        step = square / (direction @ image)
+        a_direction = product(direction)
+        step = square / (direction @ a_direction)
         if not 0 < step < math.inf:
             return th.zeros_like(b)
         x = x + step * direction
-        residual = residual - step * image
+        residual = residual - step * a_direction
         next_square = residual @ residual
         direction = residual + next_square / square * direction
         square = next_square
     return x
 
 
-def walk(
+def line_search(
     parameters: Parameters, d: th.Tensor, length: float, divergence: Callable[[], th.Tensor], target_kl: float
 ) -> float | None:
     """``θ − length · d``, shortened until the divergence is at most 1.2 times the target; returns it, or None."""

@@ -11,31 +11,30 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import depends_on, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import actor_parameters, log_prob_and_entropy
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 
-def actor_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
+def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     """The trainable parameters that log π depends on, in the policy's order, without ``log_std``."""
+    if isinstance(policy, RecurrentPolicy):
+        raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
     zero_obs: Any = create_empty_array(policy.observation_space)
     obs = obs_as_tensor(zero_obs, policy.device)
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
-    log_std = getattr(policy, "log_std", None)
-    trainable = [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter is not log_std]
-    if isinstance(policy, RecurrentPolicy):
-        raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
     training = policy.training
     policy.set_training_mode(False)
     try:
         with th.enable_grad():
-            in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], trainable)
+            parameters = actor_parameters(policy, obs, actions)
         with th.no_grad():
             # A policy keeps its last distribution, and with the graph in it could not be deep-copied
             log_prob_and_entropy(policy, obs, actions)
     finally:
         policy.set_training_mode(training)
-    searched = [parameter for parameter, is_searched in zip(trainable, in_actor, strict=True) if is_searched]
+    log_std = getattr(policy, "log_std", None)
+    searched = [parameter for parameter in parameters if parameter is not log_std]
     if not searched:
         raise ValueError(
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"

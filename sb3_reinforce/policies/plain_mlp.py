@@ -141,7 +141,9 @@ def is_plain_extractor(extractor: Any) -> bool:
 
 
 def is_plain_layer(layer: Any) -> bool:
-    """Whether a layer is linear with a bias, or an elementwise activation."""
+    """Whether a layer is linear with a bias, or an elementwise activation that does not overwrite its input."""
+    if getattr(layer, "inplace", False):
+        return False
     return type(layer) in ELEMENTWISE or (type(layer) is nn.Linear and layer.bias is not None)
 
 
@@ -161,10 +163,10 @@ def evaluate_layers(layers: list[nn.Module], x: th.Tensor) -> th.Tensor:
             x = th.tanh(x)
         else:
             x = layer(x)
-    return divide(layers[-1], x)
+    return apply_temperature(layers[-1], x)
 
 
-def divide(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
+def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
     """The outputs over τ, if the last layer has a temperature."""
     for hook in temperature_hooks(head):
         outputs = outputs / hook.temperature

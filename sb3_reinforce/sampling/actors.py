@@ -20,8 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.common.tensors import flatten
-from sb3_reinforce.policies.evaluation import Route, distribution_of, evaluate, has_own_forward
+from sb3_reinforce.policies.evaluation import Route, distribution_of, has_own_forward
 from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, overrides, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
@@ -31,9 +30,10 @@ Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 class PolicyActor:
     """Acts by the policy's own methods."""
 
-    def __init__(self, policy: ActorCriticPolicy, route: Route):
+    def __init__(self, policy: ActorCriticPolicy, route: Route, with_log_prob: bool):
         self.policy = policy
         self.route = route
+        self.with_log_prob = with_log_prob
         self.shape = policy.action_space.shape or ()
 
     @th.no_grad()
@@ -41,18 +41,12 @@ class PolicyActor:
         """Draw actions for observations of ``n_envs`` environments."""
         obs = obs_as_tensor(obs, self.policy.device)
         if not self.route.forward:
-            actions = self.policy.get_distribution(obs).get_actions()
-            return actions.cpu().numpy().reshape(-1, *self.shape), None, None
+            distribution = self.policy.get_distribution(obs)
+            actions = distribution.get_actions()
+            log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
+            return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
         actions, values, log_prob = self.policy(obs)
         return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
-
-    @th.no_grad()
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
-        """log π(a|s) of ``n_steps`` steps, shape ``(n_steps * n_envs,)``, where ``act`` does not return it."""
-        policy = self.policy
-        rows = as_policy_actions(th.as_tensor(actions, device=policy.device).flatten(0, 1), policy.action_space)
-        obs = flatten(obs_as_tensor(obs, policy.device))
-        return evaluate(policy, self.route, obs, rows, with_values=False)[0].cpu().numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy would still act as this actor does."""
@@ -90,7 +84,8 @@ class NumpyActor:
         return self.sample(outputs).reshape(self.shape), None, None
 
     @th.no_grad()
-    def log_prob(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+    def log_prob(self, actions: np.ndarray) -> np.ndarray:
+        """log π(a|s) of all ``n_steps`` steps, shape ``(n_steps * n_envs,)``."""
         outputs = th.as_tensor(np.concatenate(self.outputs))
         rows = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
         return distribution_of(self.policy, outputs, self.distribution).log_prob(rows).cpu().numpy()
@@ -120,11 +115,11 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
     return [tensor.data_ptr() for tensor in tensors]
 
 
-def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_prob: bool = True) -> Actor:
-    """The fastest actor that acts as the policy would; only with ``with_log_prob`` it can be asked for log π."""
+def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_prob: bool) -> Actor:
+    """The fastest actor that acts as the policy would; only with ``with_log_prob`` it gives log π too."""
     if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
         return NumpyActor(policy, route.actor, n_envs, with_log_prob)
-    return PolicyActor(policy, route)
+    return PolicyActor(policy, route, with_log_prob)
 
 
 def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Floats], np.ndarray]:

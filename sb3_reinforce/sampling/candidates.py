@@ -6,7 +6,8 @@ With seeds it is worked off in rounds, whose pairs start together from the seeds
 environment without a seed. Without seeds an environment whose episode ends takes the next pair.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -73,6 +74,17 @@ class EpisodeTracker:
                 self.active[env] = False
         self.deadline = self.max_episode_steps + int(self.started_at[self.active].min(initial=self.clock))
         return restarted
+
+
+def seeds_of(shape: Sequence[int], n_episodes: int, first_seed: int) -> np.ndarray:
+    """
+    Seeds of the episodes of candidates, shape ``(k, n_episodes)``.
+
+    Candidates of shape ``(k, n)`` share their seeds; of ``(m, k, n)`` only those of one column do, as in a pair.
+    """
+    n_columns = shape[1] if len(shape) == 3 else 1
+    columns = np.arange(math.prod(shape[:-1])) % n_columns
+    return (first_seed + columns[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
 
 
 def evaluate_candidates(

@@ -14,12 +14,12 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
-from sb3_reinforce.common.tensors import map_parts, take
+from sb3_reinforce.common.tensors import map_parts
 from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.evaluation import Route, route_of
-from sb3_reinforce.sampling.actors import Actor
+from sb3_reinforce.sampling.actors import Actor, NumpyActor
 
-Bools: TypeAlias = NDArray[np.bool_]
 # The terminal observation at each (step, environment) where a time limit ended an episode that counts
 TerminalObs: TypeAlias = dict[tuple[int, int], Any]
 
@@ -111,12 +111,13 @@ def collect(
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
-        model._last_obs = new_obs  # type: ignore[assignment]
-        model._last_episode_starts = dones
         if is_attached:
             callback.update_locals(locals())
             if not callback.on_step():
                 return None
+        # After the callback, which finds s_t there, as with A2C
+        model._last_obs = new_obs  # type: ignore[assignment]
+        model._last_episode_starts = dones
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
         starts.append(dones.astype(bool))
@@ -130,9 +131,7 @@ def collect(
                     # Some VecEnvs write the next terminal observation into the same array
                     terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
         if is_attached and not actor.is_current(model.policy):
-            # Other actors have returned log π with the actions
-            if log_probs is None:
-                write_log_probs(rollout_buffer, actor, first_row)
+            write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
             route = route_of(policy, route.with_critic)
             actor = actor_of(route, is_attached)
@@ -142,7 +141,7 @@ def collect(
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
     rollout_buffer.episode_starts[:] = starts[:-1]
-    if is_attached and log_probs is None:
+    if is_attached:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, route
 
@@ -170,11 +169,10 @@ def write_row(rows: Any, step: int, values: Any) -> None:
 
 
 def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None:
-    """Write log π of the rows from ``first_row`` on."""
-    if first_row < buffer.pos:
+    """Write log π of the rows from ``first_row`` on, which other actors return with the actions."""
+    if first_row < buffer.pos and isinstance(actor, NumpyActor):
         rows = slice(first_row, buffer.pos)
-        obs: Any = buffer.observations
-        buffer.log_probs[rows] = actor.log_prob(take(obs, rows), buffer.actions[rows]).reshape(-1, buffer.n_envs)
+        buffer.log_probs[rows] = actor.log_prob(buffer.actions[rows]).reshape(-1, buffer.n_envs)
 
 
 def resize(buffer: RolloutBuffer, n_steps: int) -> None:

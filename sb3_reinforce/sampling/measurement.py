@@ -5,14 +5,13 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 import numpy as np
-import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
-from sb3_reinforce.envs.starts import start_episodes
+from sb3_reinforce.envs.starts import separate, start_episodes
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -28,8 +27,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
     if getattr(model, "episodes_per_start", 1) > 1:
-        # Environments that have shared a start would go on with the same random numbers
-        env.seed(int(th.randint(2**31, ())))
+        separate(env)
     with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
         yield
         obs = env.reset()

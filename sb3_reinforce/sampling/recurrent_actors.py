@@ -5,10 +5,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
+from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import (
     has_numpy_form,
@@ -20,7 +20,6 @@ from sb3_reinforce.policies.plain_mlp import (
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
 
-Bools: TypeAlias = NDArray[np.bool_]
 # Which of the environments start an episode with the observation at hand
 Starts: TypeAlias = Callable[[], Bools]
 
@@ -29,9 +28,8 @@ class RecurrentPolicyActor(PolicyActor):
     """Acts by the policy's own methods, from a state of shape ``(n_envs, 2, n_layers, n_hidden)``."""
 
     def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool):
-        super().__init__(policy, route_of(policy))
+        super().__init__(policy, route_of(policy), with_log_prob)
         self.starts = starts
-        self.with_log_prob = with_log_prob
         self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
 
     @th.no_grad()
@@ -43,7 +41,6 @@ class RecurrentPolicyActor(PolicyActor):
             obs_as_tensor(obs, policy.device), self.halves, episode_starts
         )
         actions = distribution.get_actions()
-        # Not in one batch after the rollout, for which the memory would be computed again
         log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
         return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
 

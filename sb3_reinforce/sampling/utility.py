@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
-from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates
+from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
 from sb3_reinforce.sampling.normalization import ObservationStatistics
 
 
@@ -46,9 +46,7 @@ class EpisodicUtility:
         model = self.model
         n_episodes = model.n_eval_episodes
         thetas = check_candidates(candidates, self.n_parameters).reshape(-1, self.n_parameters)
-        n_columns = candidates.shape[1] if candidates.dim() == 3 else 1
-        columns = np.arange(len(thetas)) % n_columns
-        seeds = (self.first_seed + columns[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
+        seeds = seeds_of(candidates.shape, n_episodes, self.first_seed)
         processes = model._processes
         # Each process evaluates a part of the candidates
         own = slice(None) if processes is None else np.array_split(range(len(thetas)), processes.size)[processes.rank]

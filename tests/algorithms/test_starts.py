@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from callbacks import Record
+from callbacks import At, Record
 from environments import Scales
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -15,7 +15,7 @@ from models import plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_reinforce import REINFORCE, GymnasiumVecEnv
+from sb3_reinforce import REINFORCE, FiniteDifference, GymnasiumVecEnv
 from sb3_reinforce.diagnostics import compare_starts, sample
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.weights import training_batch
@@ -145,6 +145,21 @@ def test_after_groups_the_environments_are_independent_again(measure):
     if measure is sample:
         assert len(np.unique(found.observations[0], axis=0)) == 8
     assert len(np.unique(env.reset(), axis=0)) == 8
+
+
+MODELS_THAT_SHARE_STARTS = {
+    "groups": lambda env: REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0),
+    "search": lambda env: FiniteDifference("LinearPolicy", env, seed=0),
+}
+
+
+@pytest.mark.parametrize("end", [1, 50])
+@pytest.mark.parametrize("name", MODELS_THAT_SHARE_STARTS)
+def test_after_training_the_environments_are_independent_again(name, end):
+    """Also where a callback stops the training."""
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    MODELS_THAT_SHARE_STARTS[name](env).learn(1, At(end) if end > 1 else None)
+    assert len(np.unique(env.reset(), axis=0)) == 4
 
 
 def test_memory_takes_one_episode_of_each_environment():

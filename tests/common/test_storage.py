@@ -261,6 +261,16 @@ def test_the_states_of_other_optimizers_are_loaded(optimizer, kind, tmp_path):
 
 
 @both
+def test_a_state_may_lack_flags_that_a_newer_pytorch_has(kind):
+    model = make(kind, Corridor()).learn(32)
+    states = groups_with(model.get_parameters())
+    for group in states["policy.optimizer"]["param_groups"]:
+        del group["decoupled_weight_decay"]
+    model.set_parameters(states)
+    model.learn(32)
+
+
+@both
 def test_moments_of_another_shape_are_refused_before_the_first_step_too(kind):
     states = WRONG["another optimizer's moments"](make(kind, Corridor()).learn(32).get_parameters())
     with pytest.raises(ValueError, match=r"exp_avg of parameter 0 must have shape .* got \(3, 77\)"):

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+from sb3_reinforce.diagnostics import check_gradient
 
 ACTION_SPACES = [
     spaces.Discrete(3),
@@ -66,6 +66,7 @@ def trained(**kwargs):
         trained,
         partial(REINFORCE, "MlpPolicy", "CartPole-v1", normalize_advantage=True, discount_scores=True, ent_coef=0.1),
         two_episodes("CartPole-v1", temperature=0.5, normalize_by="episodes"),
+        two_episodes("CartPole-v1", step="natural"),
         two_episodes(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy"),
         # Also where a step along the gradient is less than the rounding of the parameters
         *(two_episodes(pays(scale), baseline="none") for scale in (1e-7, 1.0, 1e4)),
@@ -109,27 +110,6 @@ def test_gsde_cuts_its_scores_unless_it_learns_features():
     assert check_gradient(model).failures == ["scores"]
     model.policy.action_dist.learn_features = True
     assert check_gradient(model).passed
-
-
-class Bounded(th.nn.Module):
-    """A parametrization: |log σ| < 2."""
-
-    def forward(self, log_std):
-        return 2 * th.tanh(log_std)
-
-
-@pytest.mark.parametrize("is_shared", [True, False])
-def test_a_standard_deviation_shared_between_actions_or_parametrized_passes(is_shared):
-    model = REINFORCE("MlpPolicy", corridor(ACTION_SPACES[2]), baseline="optimal", n_episodes=3, device="cpu", seed=0)
-    if is_shared:
-        model.policy.log_std = th.nn.Parameter(th.zeros(1))
-    else:
-        th.nn.utils.parametrize.register_parametrization(model.policy, "log_std", Bounded())
-    model.policy.optimizer = th.optim.Adam(model.policy.parameters(), lr=1e-3)
-    model.learn(30)
-    table = check_gradient(model)
-    assert table.passed, table
-    assert compare_baselines(model, 6, n_resamples=2)["optimal"].variance.value > 0
 
 
 def altered(log_prob=lambda log_prob, actions: log_prob, actions=lambda actions: actions):

@@ -8,7 +8,7 @@ import torch as th
 from enumeration import LOGITS, episode_terms, log_pi
 from environments import Tree
 
-from sb3_reinforce.diagnostics.estimator_comparison import judge
+from sb3_reinforce.diagnostics.estimator_comparison import compare_to_reference
 from sb3_reinforce.diagnostics.statistics import (
     Moments,
     compute_moments,
@@ -96,7 +96,7 @@ def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same
         gradients, others = draw(m, generator) + shift, draw(m, generator) + shift + scale * th.ones(8)
         found = gradient_statistics(gradients, reference, n_resamples=200, seed=seed).cosine
         covered += found.low <= truth <= found.high
-        found = judge(gradients, others, 200, 0.95, seed)[0]
+        found = compare_to_reference(gradients, others, 200, 0.95, seed)[0]
         both += found.low <= truth <= found.high
     assert min(covered, both) >= 450, (covered, both)
 
@@ -116,7 +116,7 @@ def test_the_noise_of_the_reference_does_not_lower_the_cosine():
     values = []
     for _ in range(400):
         gradients, reference = draw(400, generator), draw(40, generator) + shift
-        values.append(judge(gradients, reference, 1, 0.95, 0)[0].value)
+        values.append(compare_to_reference(gradients, reference, 1, 0.95, 0)[0].value)
     assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch as th
 from enumeration import make_model, true_gradient
-from environments import Corridor, Tree
+from environments import Corridor, Scales, Tree
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
@@ -88,6 +89,28 @@ def test_a_landscape_rises_along_the_gradient():
     assert (found.utilities[:, -1] > found.utilities[:, 0]).all()
     assert np.ptp(found.utilities.mean(axis=1)) < 0.2
     assert found.steps["ĝ"][0] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_the_plane_has_the_scale_of_theta(monkeypatch):
+    model = bandit()
+    asked = []
+    with th.no_grad():
+        # The biases are 0: the norm is √2
+        model.policy.action_net.weight.fill_(1.0)
+    monkeypatch.setattr(CandidateUtility, "__call__", lambda self, x: asked.append(x - self.theta) or x[:, 0])
+    landscape(model, directions=th.tensor([[5.0, 0, 0, 0], [0, 0.1, 0, 0]]), extent=2.0, n_points=2)
+    assert asked[0][0].tolist() == pytest.approx([-2 * 2**0.5, -2 * 2**0.5, 0, 0])
+    landscape(model, n_points=2)
+    assert ((asked[1][1] - asked[1][0]) / 2).abs().tolist() == pytest.approx([1, 1, 0, 0])
+
+
+def test_candidates_share_their_starts_and_calls_do_not():
+    env = DummyVecEnv([lambda: Scales(effect=0.0)] * 4)
+    utility = CandidateUtility(REINFORCE("MlpPolicy", env, device="cpu"), 1, seed=0)
+    found = th.stack([utility(utility.theta.repeat(4, 1)) for _ in range(20)])
+    assert (found == found[:, :1]).all() and len(found[:, 0].unique()) == 2
+    pairs = utility(utility.theta.repeat(2, 20, 1))
+    assert th.equal(pairs[0], pairs[1]) and len(pairs[0].unique()) == 2
 
 
 def test_directions_are_normalized_filter_by_filter():

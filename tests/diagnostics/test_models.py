@@ -155,6 +155,12 @@ def test_other_models_are_refused(measure):
         measure(A2C("MlpPolicy", "CartPole-v1", device="cpu"))
 
 
+def test_a_sample_without_values_has_monte_carlo_returns():
+    """λ weights values, and a sample with another baseline has none."""
+    model = REINFORCE("MlpPolicy", Corridor((5,)), gae_lambda=0.5, gamma=1.0, device="cpu")
+    assert sample(model, 2, baseline="none").returns[:5, 0].tolist() == [5, 4, 3, 2, 1]
+
+
 def test_a_landscape_needs_an_actor_critic_policy():
     with pytest.raises(TypeError, match="actor-critic policy"):
         landscape(DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=10))

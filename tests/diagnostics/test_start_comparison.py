@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_starts
-from sb3_reinforce.diagnostics.start_comparison import gram_matrices, sample_starts, side_by_side
+from sb3_reinforce.diagnostics.start_comparison import by_start, gram_matrices, sample_starts
 from sb3_reinforce.diagnostics.statistics import gram
 from sb3_reinforce.estimation import gradients_by_episode, leave_one_out
 
@@ -56,8 +56,8 @@ def test_ragged_episodes_have_the_gradients_of_training(env):
     """The lengths differ within groups of eight, or between them; the baseline is the one that training would have."""
     model = REINFORCE("MlpPolicy", DummyVecEnv([env] * 8), baseline="leave_one_out", seed=0)
     rollouts = sample_starts(model, 8)
-    returns = side_by_side([rollout.returns * rollout.used for rollout in rollouts])
-    used = side_by_side([rollout.used.double() for rollout in rollouts])
+    returns = by_start([rollout.returns * rollout.used for rollout in rollouts])
+    used = by_start([rollout.used.double() for rollout in rollouts])
     assert not used.all()
     grams = gram_matrices(rollouts, returns, used)
     for m in (2, 4, 8):

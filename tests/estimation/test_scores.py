@@ -1,6 +1,7 @@
 """The gradients of all episodes are those of one backward pass each, whatever the policy and the memory."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch as th
@@ -74,6 +75,9 @@ IMAGES = {"screen_height": 36, "screen_width": 36, "n_channels": 1, "discrete": 
 POLICIES = {
     "temperature": lambda: collect(Corridor((2, 9)), temperature=0.3),
     "net_arch": lambda: collect(Corridor((2, 9)), policy_kwargs={"net_arch": [8, 8], "ortho_init": False}),
+    "in place": lambda: collect(
+        Corridor((2, 9)), policy_kwargs={"activation_fn": partial(th.nn.ReLU, inplace=True), "ortho_init": False}
+    ),
     "gSDE": lambda: collect(Corridor((2, 9), action_space=BOX), use_sde=True),
     "images": lambda: collect(FakeImageEnv(**IMAGES), "CnnPolicy", n_episodes=2),
     "dicts": lambda: collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2),

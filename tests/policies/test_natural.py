@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch as th
+from callbacks import Record
 from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
@@ -22,8 +23,9 @@ from torch.distributions import kl_divergence
 from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
-from sb3_reinforce.policies.natural import conjugate_gradients, natural_step, walk
+from sb3_reinforce.policies.natural import conjugate_gradients, line_search, natural_step
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 # The states of the tree, as often as a rollout might visit them
@@ -210,7 +212,7 @@ def test_a_step_that_cannot_be_measured_is_taken_back(answer):
     weight = th.nn.Parameter(th.ones(3))
     divergence = Mock(side_effect=answer if isinstance(answer, Exception) else lambda: th.tensor(answer))
     with pytest.raises(MemoryError) if isinstance(answer, MemoryError) else nullcontext():
-        assert walk([weight], th.ones(3), 1.0, divergence, 0.01) is None
+        assert line_search([weight], th.ones(3), 1.0, divergence, 0.01) is None
     assert th.equal(weight, th.ones(3))
 
 
@@ -222,7 +224,7 @@ def test_an_indefinite_system_has_no_direction(matrix):
 def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
     """The divergence of a policy that is almost deterministic grows faster than the square of the step."""
     weight = th.nn.Parameter(th.zeros(1))
-    kl = walk([weight], th.ones(1), 10.0, lambda: (weight**8).sum(), 0.01)
+    kl = line_search([weight], th.ones(1), 10.0, lambda: (weight**8).sum(), 0.01)
     assert 0.01 / 2**8 <= kl <= 0.012
 
 
@@ -286,3 +288,15 @@ def test_a_target_may_fall_to_0_also_in_a_saved_model(tmp_path, recwarn):
     found = divergences_of(REINFORCE.load(tmp_path / "model", env=env), 256)
     np.testing.assert_allclose(found, [0.01, 0.0], rtol=0.2)
     assert not recwarn
+
+
+def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one():
+    old = Record(lambda model: deepcopy(model.policy))
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=64, learning_rate=0.05, seed=0, device="cpu").learn(64, old)
+    batch = training_batch(model.rollout, model.rollout_buffer, normalize=False)
+    before, after = (
+        policy.evaluate_actions(batch.observations, batch.actions)[1].double().detach()
+        for policy in (old.records[0], model.policy)
+    )
+    expected = float(((after - before).exp() - 1 - (after - before)).mean())
+    assert 1e-4 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-3)

@@ -19,7 +19,7 @@ def make(policy_class: type[ActorCriticPolicy], obs: spaces.Space = OBS, **kwarg
 
 
 def names(policy: ActorCriticPolicy) -> set[str]:
-    actor = {id(parameter) for parameter in parameters.actor_parameters(policy)}
+    actor = {id(parameter) for parameter in parameters.searched_parameters(policy)}
     return {name for name, parameter in policy.named_parameters() if id(parameter) in actor}
 
 
@@ -39,7 +39,7 @@ def test_a_shared_features_extractor_is_part_of_the_actor() -> None:
 
 def test_read_and_write_are_an_exact_round_trip() -> None:
     policy = make(ActorCriticPolicy)
-    actor = parameters.actor_parameters(policy)
+    actor = parameters.searched_parameters(policy)
     before, theta = policy.state_dict(), parameters.read(actor)
     before = {name: value.clone() for name, value in before.items()}
     assert theta.dtype == th.float64 and theta.shape == (sum(p.numel() for p in actor),)
@@ -54,7 +54,7 @@ def test_an_actor_without_trainable_parameters_is_an_error() -> None:
     policy = make(LinearPolicy)
     policy.action_net.requires_grad_(False)
     with pytest.raises(ValueError, match="no trainable parameters"):
-        parameters.actor_parameters(policy)
+        parameters.searched_parameters(policy)
 
 
 def test_linear_policy_refuses_hidden_layers() -> None:
@@ -73,7 +73,7 @@ def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
 
     search.set_parameters(reinforce.get_parameters(), exact_match=False)
     assert np.array_equal(*actions())
-    assert th.equal(search.theta, parameters.read(parameters.actor_parameters(reinforce.policy)))
+    assert th.equal(search.theta, parameters.read(parameters.searched_parameters(reinforce.policy)))
     search.learn(1)
     reinforce.set_parameters(search.get_parameters(), exact_match=False)
     assert np.array_equal(*actions())

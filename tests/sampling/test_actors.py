@@ -36,7 +36,7 @@ def make_policy(space=SPACES[0], policy="MlpPolicy", **kwargs):
 
 
 def actor_of(policy, n_envs):
-    return make_actor(policy, route_of(policy), n_envs)
+    return make_actor(policy, route_of(policy), n_envs, with_log_prob=True)
 
 
 @pytest.mark.parametrize(("space", "kwargs"), [*((space, {}) for space in SPACES), (SPACES[0], {"temperature": 0.3})])
@@ -48,16 +48,17 @@ def test_the_same_seed_gives_the_same_actions(space, kwargs, activation_fn, n_en
     obs = np.random.default_rng(0).normal(size=(20, n_envs, 5)).astype(np.float32)
     actions = []
     fast = actor_of(policy, n_envs)
-    general = PolicyActor(policy, route_of(policy))
+    general = PolicyActor(policy, route_of(policy), with_log_prob=True)
     assert isinstance(fast, NumpyActor)
     for actor in (fast, general):
         th.manual_seed(1)
-        actions.append(np.stack([actor.act(row)[0] for row in obs]))
+        drawn, _, log_probs = zip(*map(actor.act, obs), strict=True)
+        actions.append(np.stack(drawn))
     np.testing.assert_allclose(*actions, rtol=1e-4, atol=1e-5)
     assert actions[0].dtype == actions[1].dtype and np.ptp(actions[0]) > 0
     stored = actions[0].reshape(20, n_envs, -1)
     # Where log π is near 0, what is left is the rounding of logits of order 1
-    np.testing.assert_allclose(fast.log_prob(obs, stored), general.log_prob(obs, stored), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(fast.log_prob(stored), np.concatenate(log_probs), rtol=1e-4, atol=1e-5)
 
 
 class OwnForward(ActorCriticPolicy):
@@ -101,7 +102,7 @@ def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
     actor, expected = actor_of(policy, N_DRAWS), probability()
     share = actor.act(obs)[0].mean()
     assert share == pytest.approx(expected, abs=4 * 0.5 / N_DRAWS**0.5)
-    assert isinstance(actor, NumpyActor) == (change == "none") and abs(before - expected) < 1
+    assert isinstance(actor, NumpyActor) == (change == "none")
     assert change in SLIGHT or abs(before - expected) > 0.2
 
 

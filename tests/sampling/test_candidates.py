@@ -60,7 +60,7 @@ def sample(space, n):
 
 
 def perturbed(policy, k, scale=0.3):
-    actor = parameters.actor_parameters(policy)
+    actor = parameters.searched_parameters(policy)
     theta = parameters.read(actor)
     generator = th.Generator().manual_seed(0)
     return actor, theta + scale * th.randn(k, len(theta), dtype=th.float64, generator=generator)
@@ -151,7 +151,7 @@ class Counting(gym.Env):
 def evaluate(env, lengths, seeds=None, n_episodes=1, max_episode_steps=100):
     """The returns and steps of linear policies, of which candidate i ends its episodes after ``lengths[i]`` steps."""
     policy = LinearPolicy(env.observation_space, Counting.action_space, lambda _: 1e-3)
-    actor = make_candidate_actor(policy, parameters.actor_parameters(policy), env.num_envs, True)
+    actor = make_candidate_actor(policy, parameters.searched_parameters(policy), env.num_envs, True)
     # The last observation is 1
     thetas = th.zeros(len(lengths), *env.observation_space.shape).double()
     thetas[:, -1] = (th.tensor(lengths) - 1) / 10

@@ -28,7 +28,7 @@ def recorded(actor, n_steps=200, n_envs=3):
         log_probs.append(log_prob)
         states.append(actor.state())
     if log_probs[0] is None:
-        log_probs = actor.log_prob(obs, np.array(actions).reshape(n_steps, n_envs, -1))
+        log_probs = actor.log_prob(np.array(actions).reshape(n_steps, n_envs, -1))
     return obs, starts, np.array(actions), th.stack(states), np.ravel(log_probs)
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
+from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -56,6 +57,7 @@ def test_a_cut_episode_without_a_critic_is_left_out_with_a_warning():
         model.learn(10)
     assert model.rollout.used.flatten().tolist() == [True] * 8 + [False] * 2
     assert model.rollout_buffer.advantages[8:].tolist() == [[0], [0]]
+    assert model.rollout_buffer.returns[8:].tolist() == [[0], [0]]
     assert model.logger.name_to_value["rollout/complete_fraction"] == 0.8
 
 
@@ -138,6 +140,42 @@ def test_the_buffer_is_that_of_a2c():
     make_model("CartPole-v1", 3, n_steps=12).learn(36, callback=Record(check))
 
 
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
+def test_log_probs_are_those_of_the_policy_that_acted(activation_fn):
+    """Also where a callback changes its parameters in place during the rollout."""
+
+    def change(model):
+        with th.no_grad():
+            log_probs.append(model.policy.get_distribution(obs_of(model)).log_prob(actions_of(model)))
+            model.policy.action_net.weight.normal_()
+
+    def obs_of(model):
+        return th.as_tensor(model.rollout_buffer.observations[len(log_probs)])
+
+    def actions_of(model):
+        return th.as_tensor(model.rollout_buffer.actions[len(log_probs)]).flatten()
+
+    log_probs = []
+    model = make_model("CartPole-v1", 2, n_steps=8, policy_kwargs={"activation_fn": activation_fn})
+    model.learn(16, Record(change, "step"))
+    np.testing.assert_allclose(model.rollout_buffer.log_probs, th.stack(log_probs), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("baseline", "expected"), [("value", [3, 2, 1] * 2), ("none", [3] * 6)])
+def test_the_critic_is_fitted_to_returns_to_go_also_with_the_total_return(baseline, expected):
+    arguments = {"gamma": 1.0, "n_steps": 6, "baseline": baseline, "reward_to_go": False}
+    model = make_model(lambda: Corridor((3,)), **arguments).learn(6)
+    assert model.rollout_buffer.returns.ravel().tolist() == expected
+
+
+@pytest.mark.parametrize("algorithm", [REINFORCE, A2C])
+def test_at_a_step_the_last_observation_is_the_one_that_was_acted_on(algorithm):
+    model = algorithm("MlpPolicy", Corridor((4,)), n_steps=8, device="cpu")
+    steps = Record(lambda model: int(model._last_obs.argmax()), "step")
+    model.learn(8, steps)
+    assert steps.records == [0, 1, 2, 3, 0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
 @pytest.mark.parametrize("callback", [None, lambda *_: True])
@@ -153,7 +191,8 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_
     model.learn(1, callback)
     assert calls.count("get_distribution") == (0 if activation_fn is th.nn.Tanh else model.rollout_buffer.size())
     assert model.rollout_buffer.log_probs.any() == (callback is not None)
-    assert calls.count("predict_values") <= (3 if baseline == "value" else 0)
+    # It is asked once, for the parameters that V depends on
+    assert calls.count("predict_values") == (baseline == "value")
 
 
 class OwnForward(ActorCriticPolicy):

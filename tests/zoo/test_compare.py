@@ -78,14 +78,7 @@ def test_settings_of_an_atari_game():
     have_settings = {name for name in compare.ALGORITHMS if compare.settings_of(name, "ALE/Pong-v5")}
     assert have_settings == {"reinforce", "a2c", "ppo"}
     run = compare.Run("ALE/Pong-v5", "reinforce", 0, 600)
-    model, env, eval_env = compare.make(run)
-    assert isinstance(model.policy, ActorCriticCnnPolicy)
-    evaluations = compare.Evaluations(run, env, eval_env)
-    evaluations.model = model
-    env.step(model.predict(env.reset())[0])
-    model.num_timesteps += env.num_envs
-    # A step is four frames, which the environments count, and a game starts with some that nobody plays
-    assert evaluations.steps() == env.num_envs < sum(env.get_attr("total_steps")) / 4
+    assert isinstance(compare.make(run)[0].policy, ActorCriticCnnPolicy)
 
 
 def test_models_have_the_settings_that_train_would_read(tmp_path, monkeypatch):
