@@ -4,7 +4,8 @@
 # In a T-maze (Bakker, 2001) the first observation says whether the goal is to the left or to the right of the junction
 # at the end of a corridor. Every later one only says where the corridor ends. The turn towards the goal earns 1 and the
 # other one −1, so a policy without a memory can do no better than 0. The likelihood ratio holds for partial
-# observations as it stands: only $\log \pi$ is differentiated, now back through the memory to the start of each episode.
+# observations as it stands: only $\log \pi$ is differentiated, now back through the memory to the start of each
+# episode.
 #
 # As a script it takes arguments: `python examples/13_memory.py --length 20 --memory rnn --timesteps 200000`.
 

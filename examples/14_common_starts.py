@@ -12,12 +12,15 @@
 # %%
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_starts
+
+th.set_num_threads(1)
 
 
 class Courier(gym.Env[np.ndarray, np.int64]):
@@ -42,8 +45,9 @@ class Courier(gym.Env[np.ndarray, np.int64]):
 def make_model(episodes_per_start: int, seed: int) -> REINFORCE:
     env = make_vec_env(Courier, 32, seed=seed)
     return REINFORCE(
-        "MlpPolicy", env, baseline="leave_one_out", n_episodes=32, episodes_per_start=episodes_per_start, seed=seed
-    )
+        "MlpPolicy", env, baseline="leave_one_out", n_episodes=32, episodes_per_start=episodes_per_start, seed=seed,
+        device="cpu",
+    )  # fmt: skip
 
 
 # %% [markdown]

@@ -4,8 +4,8 @@ How do REINFORCE and FiniteDifference compare with A2C, PPO, TRPO and ARS: by st
     python examples/benchmarks/compare.py --tasks CartPole-v1 LunarLander-v3 --seeds 0 1 2 3 4 --output results.csv
 
 All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the RL Zoo's
-settings (for another version of the task where it has none for this one), and ours take ``sb3_reinforce.zoo``'s; the
-two searches and TRPO are run only on tasks that they have settings for.
+settings (for another version of the task where it has none for this one, or else its default), and ours take
+``sb3_reinforce.zoo``'s; the two searches are run only on tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
@@ -90,7 +90,9 @@ def make(run: Run, params: dict[str, Any] | None = None) -> tuple[BaseAlgorithm,
         # Ours are read as by the command train, which leaves out what does not go with the task
         settings = manager.read_hyperparameters()[0] if run.algorithm in OURS else settings_of(run.algorithm, run.task)
         kwargs, manager.env_wrapper, _, manager.vec_env_wrapper = manager._preprocess_hyperparams(settings)
+        # ARS plays the episodes of a candidate alone
         env = manager.create_envs(1 if run.algorithm == "ars" else manager.n_envs, no_log=True)
+        kwargs = manager._preprocess_action_noise(kwargs, {}, env)
         # The same for all algorithms, other than in training
         manager.seed = 10_000 + run.seed
         eval_env = manager.create_envs(EVALUATION_EPISODES, eval_env=True)
@@ -116,12 +118,8 @@ class Evaluations(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
-    def steps(self) -> int:
-        """ARS counts some of its steps more than once; environments count each frame that an Atari game skips."""
-        return sum(self.env.get_attr("total_steps")) if self.run.algorithm == "ars" else self.model.num_timesteps
-
     def _on_rollout_start(self) -> None:
-        twentieth = self.steps() * N_EVALUATIONS // self.run.budget
+        twentieth = self.model.num_timesteps * N_EVALUATIONS // self.run.budget
         if twentieth >= self.twentieth:
             self.evaluate("training", EVALUATION_EPISODES)
             self.twentieth = twentieth + 1
@@ -130,7 +128,8 @@ class Evaluations(BaseCallback):
         self.spent += clocks() - self.since
         sync_envs_normalization(self.env, self.eval_env)
         mean, std = evaluate_policy(self.model, self.eval_env, episodes)
-        row = (*self.run, evaluation, self.steps(), *self.spent.round(2), round(mean, 3), round(std, 3), episodes)
+        figures = (*self.spent.round(2), round(mean, 3), round(std, 3), episodes)
+        row = (*self.run, evaluation, self.model.num_timesteps, *figures)
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self.since = clocks()
 

@@ -3,10 +3,10 @@ What a comparison shows: tables, and pictures by rliable (intervals are 95 % of 
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 
-Writes results_curves.png (the interquartile mean of the seeds against steps and against seconds) and
-results_summary.png (interquartile mean, performance profiles and probability of improvement over all tasks), and prints
-the final evaluations as a Markdown table. In the summary 0 is a random policy and 1 the Zoo's published PPO; it has the
-algorithms that were run on every task.
+Writes results_curves.png (the interquartile mean of the seeds against steps, and against seconds of a core, of the
+seeds that all algorithms were run on) and results_summary.png (interquartile mean, performance profiles and probability
+of improvement over all tasks), and prints the final evaluations as a Markdown table. In the summary 0 is a random
+policy and 1 the Zoo's published PPO; it has the algorithms that were run on every task.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from scipy.stats import trim_mean
 from sb3_reinforce.diagnostics.plots import COLOURS
 
 REPETITIONS = 2000
+CLOCKS = {"cpu_seconds": "seconds of a core", "seconds": "seconds of training"}
 LABELS = {
     "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
     "trpo": "TRPO",
@@ -73,14 +74,15 @@ def draw_curves(results: pd.DataFrame, clock: str) -> None:
     figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
     pairs = grid.reshape(-1, 2)
     for axes, ((task, budget), runs) in zip(pairs, tasks, strict=False):
-        for algorithm, mine in runs.groupby("algorithm", sort=False):
-            seconds = mine[mine["evaluation"] == "final"][clock].median()
-            for axis, column, end in zip(axes, ("steps", clock), (budget, seconds), strict=True):
+        timed = runs[runs["seed"].isin(set.intersection(*(set(each) for _, each in runs.groupby("algorithm")["seed"])))]
+        for axis, column, drawn in zip(axes, ("steps", clock), (runs, timed), strict=True):
+            for algorithm, mine in drawn.groupby("algorithm", sort=False):
+                end = budget if column == "steps" else mine[mine["evaluation"] == "final"][clock].median()
                 points, iqm, (low, high) = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
         axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
-        axes[1].set(title=task, xlabel="seconds of training", xscale="symlog")
+        axes[1].set(title=task, xlabel=CLOCKS[clock], xscale="symlog")
     for axis in pairs[len(tasks) :].flat:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task
@@ -157,7 +159,7 @@ def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[st
 def table(results: pd.DataFrame, clock: str) -> str:
     """The final evaluations: median over the seeds, least and greatest, and the median of the seconds."""
     lines = [
-        "| task (steps) | algorithm | seeds | return: median (least, greatest) | seconds |",
+        f"| task (steps) | algorithm | seeds | return: median (least, greatest) | {CLOCKS[clock]} |",
         "|---|---|---|---|---|",
     ]
     final = results[results["evaluation"] == "final"]
@@ -174,7 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="CSVs that compare.py has written")
     parser.add_argument("--output", type=Path, required=True, help="path of the pictures, without suffix")
-    parser.add_argument("--clock", default="seconds", choices=["seconds", "cpu_seconds"])
+    parser.add_argument("--clock", default="cpu_seconds", choices=list(CLOCKS))
     arguments = parser.parse_args()
     matplotlib.use("agg")
     results = pd.concat(pd.read_csv(path) for path in arguments.results)

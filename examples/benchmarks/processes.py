@@ -266,6 +266,8 @@ def main() -> None:
         if is_leader():
             print(json.dumps(result))
         return
+    if arguments.output is None:
+        parser.error("--output is missing")
     rows = pd.DataFrame(measure(arguments.rounds) + Model().rows())
     unknown = rows.seconds.isna() & rows.wait_fraction.notna()
     rows.loc[unknown, "seconds"] = (rows.steps.median() / rows.rate[unknown]).round(2)

@@ -1,9 +1,10 @@
 """
 How many gradients a second does FiniteDifference estimate, beside SB3-Contrib's ARS?
 
-Both evaluate the same number of candidates, an episode each, on the same VecEnv with one thread; the learning rate is
-0, so that the policies, and with them the lengths of the episodes, stay as they are. The two take turns in each round;
-the median, least and greatest ratio of the rounds are printed, as CSV.
+Both evaluate the same number of candidates, an episode each, with one thread. FiniteDifference has several environments
+and ARS one: it plays the episodes of a candidate alone, and with more environments would throw most of their steps
+away. All episodes of a task should have one length, or the two would not do the same work; the learning rate is 0. The
+two take turns in each round; the median, least and greatest ratio of the rounds are printed, as CSV.
 
     python examples/benchmarks/search_throughput.py --env Pendulum-v1 --policy LinearPolicy
 """
@@ -22,9 +23,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_reinforce import FiniteDifference
 
 
-def gradients_per_second(algorithm: type, arguments: argparse.Namespace, **kwargs: object) -> float:
+def gradients_per_second(algorithm: type, n_envs: int, arguments: argparse.Namespace, **kwargs: object) -> float:
     """The pace of as many updates as are asked for, after a first one that is not counted."""
-    env = make_vec_env(arguments.env, arguments.n_envs, seed=0)
+    env = make_vec_env(arguments.env, n_envs, seed=0)
     kwargs = {"n_delta": arguments.n_delta, "learning_rate": 0.0, "seed": 0, "device": "cpu", **kwargs}
     model = algorithm(arguments.policy, env, **kwargs).learn(1)
     start = time.perf_counter()
@@ -37,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="Pendulum-v1")
     parser.add_argument("--policy", default="LinearPolicy", help="LinearPolicy or MlpPolicy")
-    parser.add_argument("--n-envs", type=int, default=8)
+    parser.add_argument("--n-envs", type=int, default=8, help="environments of FiniteDifference")
     parser.add_argument("--n-delta", type=int, default=16, help="pairs of candidates per gradient")
     parser.add_argument("--updates", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=5)
@@ -46,8 +47,8 @@ def main() -> None:
     warnings.filterwarnings("ignore")
     ratios = []
     for _ in range(arguments.rounds):
-        ours = gradients_per_second(FiniteDifference, arguments, estimator="central")
-        ratios.append(ours / gradients_per_second(ARS, arguments, zero_policy=False))
+        ours = gradients_per_second(FiniteDifference, arguments.n_envs, arguments, estimator="central")
+        ratios.append(ours / gradients_per_second(ARS, 1, arguments, zero_policy=False))
     writer = csv.writer(sys.stdout)
     writer.writerow(["env", "policy", "rounds", "median", "least", "greatest"])
     figures = (statistics.median(ratios), min(ratios), max(ratios))

@@ -3,9 +3,8 @@ Does FiniteDifference end as high as SB3-Contrib's ARS with the RL Zoo's setting
 
     python examples/benchmarks/search_vs_ars.py --env Pendulum-v1 --seeds 20 21 22 23 24
 
-FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Steps are counted in the environments themselves, since
-ARS counts some more than once. Each run ends with the mean return of 100 episodes of the final policy, and adds a line
-to results/search_vs_ars.csv.
+FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Each run ends with the mean return of 100 episodes of the
+final policy, and adds a line to results/search_vs_ars.csv.
 """
 
 import argparse
@@ -33,10 +32,9 @@ class LastWithin(BaseCallback):
         self.timesteps = timesteps
 
     def _on_rollout_start(self) -> None:
-        steps = sum(self.training_env.get_attr("total_steps"))
-        if steps <= self.timesteps:
+        if self.num_timesteps <= self.timesteps:
             self.policy = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
-            self.steps = steps
+            self.steps = self.num_timesteps
 
     def _on_step(self) -> bool:
         return True
