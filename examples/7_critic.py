@@ -71,8 +71,8 @@ plt.show()
 
 # %% [markdown]
 # An untrained critic knows nothing of the future, so $\lambda = 0$ loses most of the gradient. With a trained one it
-# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ is in between, with next to no bias. At $\lambda = 1$ a
-# wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
+# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ is in between, with next to no
+# bias. At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
