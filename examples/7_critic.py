@@ -71,12 +71,13 @@ plt.show()
 
 # %% [markdown]
 # An untrained critic knows nothing of the future, so $\lambda = 0$ loses most of the gradient. With a trained one it
-# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ is in between, with next to no
-# bias. At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
+# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ then has less noise too, and no bias
+# that 300 episodes could show. At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy
+# follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
 assert noise_before[0] < noise_before[3] < noise_before[-1]
 assert noise_after[0] < noise_after[3] < noise_after[-1] and noise_after[0] < 0.85 * noise_after[-1]
 assert bias_before[0] > bias_before[3] > bias_before[-1] == 0
-assert bias_before[0] > 0.8 and bias_after[0] < 0.4
+assert bias_before[0] > 0.8 and bias_after[0] < 0.4 and bias_after[3] < 0.05

@@ -10,7 +10,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient
@@ -18,7 +17,6 @@ from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import separate
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
     Estimator,
@@ -181,6 +179,11 @@ class FiniteDifference(BasePolicyGradient):
             self._generator = new_generator()
 
     @property
+    def shares_starts(self) -> bool:
+        """Whether several environments start alike."""
+        return self.common_random_numbers
+
+    @property
     def theta(self) -> th.Tensor:
         """θ, a copy of the actor's trainable parameters, shape ``(n,)``, float64."""
         return parameters.read(self._find_parameters())
@@ -236,18 +239,16 @@ class FiniteDifference(BasePolicyGradient):
             )
         callback.on_training_start(locals(), globals())
         iteration = 0
-        try:
-            while self.num_timesteps < total_timesteps:
-                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-                self.train(self.estimate_gradient(callback))
-                iteration += 1
-                if log_interval is not None and iteration % log_interval == 0:
-                    self.dump_logs(iteration)
-        except Stopped:
-            pass
-        finally:
-            if self.common_random_numbers:
-                separate(cast(VecEnv, self.env))
+        while self.num_timesteps < total_timesteps:
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            try:
+                estimate = self.estimate_gradient(callback)
+            except Stopped:
+                break
+            self.train(estimate)
+            iteration += 1
+            if log_interval is not None and iteration % log_interval == 0:
+                self.dump_logs(iteration)
         callback.on_training_end()
         return self
 

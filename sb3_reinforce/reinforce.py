@@ -30,7 +30,7 @@ from sb3_reinforce.common.settings import (
     check_starts,
 )
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import separate, start_groups
+from sb3_reinforce.envs.starts import start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -233,6 +233,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def has_critic(self) -> bool:
         """Whether a critic is trained and used."""
         return self._function("baseline", BASELINES) is BASELINES["value"]
+
+    @property
+    def shares_starts(self) -> bool:
+        """Whether several environments start alike."""
+        return self.episodes_per_start > 1
 
     def _critic_rate(self) -> float:
         if self.critic_learning_rate is None:
@@ -541,13 +546,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        try:
-            return super().learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-            )
-        finally:
-            if self.episodes_per_start > 1:
-                separate(cast(VecEnv, self.env))
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)

@@ -20,6 +20,8 @@ from stable_baselines3.common.save_util import open_path
 from sb3_reinforce.common.processes import is_leader
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
+# Flags of optimizers, which PyTorch fills in where the state of another version of it lacks them
+FLAGS = ("decoupled_weight_decay", "foreach", "fused", "maximize", "capturable", "differentiable")
 
 
 def write_whole(target: PathOrFile, content: bytes) -> None:
@@ -91,13 +93,13 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
     groups = state.get("param_groups", [])
     if [len(group.get("params", ())) for group in groups] != [len(group["params"]) for group in own["param_groups"]]:
         return "it has other groups of parameters"
-    # PyTorch fills in flags that a state from another version of it lacks
-    numbers = {key: value for key, value in own["param_groups"][0].items() if isinstance(value, (float, tuple))}
-    for setting, value in numbers.items():
+    for setting, value in own["param_groups"][0].items():
         for group in groups:
             if setting not in group:
+                if setting in FLAGS:
+                    continue
                 return f"it has no {setting}: it belongs to another optimizer"
-            if type(group[setting]) not in (type(value), list, int):
+            if isinstance(value, (float, tuple)) and type(group[setting]) not in (type(value), list, int):
                 return f"its {setting} is {group[setting]!r}"
     parameters = dict(enumerate(parameter for group in optimizer.param_groups for parameter in group["params"]))
     for index, moments in state.get("state", {}).items():

@@ -18,13 +18,14 @@ from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.common.processes import place
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
+from sb3_reinforce.envs.starts import separate
 from sb3_reinforce.envs.workers import watch
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 
 def guarded(learn: Learn) -> Learn:
-    """``learn`` with its model's environments guarded, and with SIGTERM ending it as Ctrl-C does."""
+    """``learn`` with its model's environments guarded, and independent at its end; SIGTERM ends it as Ctrl-C does."""
 
     @wraps(learn)
     def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:
@@ -36,6 +37,11 @@ def guarded(learn: Learn) -> Learn:
                 raise ValueError(
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
+            finally:
+                if model.shares_starts and model.env is not None:
+                    separate(model.env)
+                    # The next reset, which takes the new seeds, is then one of the next learn()
+                    model._last_obs = None
 
     return cast(Learn, run)
 

@@ -1,5 +1,6 @@
 """Episodes that start from given seeds."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,9 @@ def start_groups(env: VecEnv, size: int) -> Any:
 
 def separate(env: VecEnv) -> None:
     """Give environments that have shared a start different random numbers again, from their next reset on."""
-    env.seed(int(th.randint(2**31, ())))
+    # A user's VecEnv may have no seeds
+    with suppress(NotImplementedError):
+        env.seed(int(th.randint(2**31, ())))
 
 
 def are_alike(obs: Any, size: int) -> bool:

@@ -38,8 +38,6 @@ STEPS = 4096
 Factors: TypeAlias = tuple[th.Tensor, th.Tensor]
 
 
-# cuDNN cannot differentiate the passes of a recurrent policy in evaluation mode
-@th.backends.cudnn.flags(enabled=False)
 def gradients_by_episode(
     rollout: Rollout, *weights: th.Tensor, chunk: int = CHUNK, columns: slice = slice(None)
 ) -> th.Tensor:

@@ -153,8 +153,6 @@ def sampled_divergence(
     return float((th.expm1(log_ratio) - log_ratio).mean())
 
 
-# cuDNN cannot differentiate the passes of a recurrent policy in evaluation mode
-@th.backends.cudnn.flags(enabled=False)
 def split_parameters(
     policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
 ) -> tuple[Parameters, Parameters, Parameters]:

@@ -141,6 +141,10 @@ class RecurrentPolicy(ActorCriticPolicy):
         index = index[:, longest_first]
         is_row = is_row[:, longest_first]
         state = initial_state(rows, index[0], critic)
+        network: Any = recurrence
+        if not recurrence.training and th.is_grad_enabled():
+            # cuDNN differentiates no pass in evaluation mode
+            network = th.backends.cudnn.flags(enabled=False)(lambda *inputs: recurrence(*inputs))
         n_at_once = max(1, FLOATS // (GATES * index.shape[1] * recurrence.hidden_size))
         outputs = []
         places = []
@@ -151,10 +155,10 @@ class RecurrentPolicy(ActorCriticPolicy):
             if state is not None:
                 state = (state[0][:, :n_running].contiguous(), state[1][:, :n_running].contiguous())
             if len(index) <= n_at_once:
-                output, state = recurrence(features[part], state)
+                output, state = network(features[part], state)
             else:
                 # The gates of long episodes are computed again for the backward pass: exact, in less memory
-                output, state = checkpoint(recurrence, features[part], state, use_reentrant=False)
+                output, state = checkpoint(network, features[part], state, use_reentrant=False)
             outputs.append(output[is_part])
             places.append(part[is_part])
         remembered = th.cat(outputs)

@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.policies.evaluation import Route, distribution_of, has_own_forward
+from sb3_reinforce.policies.evaluation import Route, has_own_forward
 from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, overrides, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
@@ -66,6 +66,7 @@ class NumpyActor:
         self.forward = numpy_forward(layers, n_envs)
         self.sample = sampler_of(policy, n_envs)
         self.outputs: list[Floats] = []
+        self.log_stds: list[Floats] = []
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
         self.distribution = policy.action_dist
@@ -80,7 +81,10 @@ class NumpyActor:
     def act(self, obs: Any) -> Acted:
         outputs = self.forward(obs)
         if self.with_log_prob:
+            # Copies, since a callback may change the parameters in place
             self.outputs.append(outputs.copy())
+            if isinstance(self.distribution, DiagGaussianDistribution):
+                self.log_stds.append(np.broadcast_to(self.policy.log_std.detach().numpy(), outputs.shape).copy())
         return self.sample(outputs).reshape(self.shape), None, None
 
     @th.no_grad()
@@ -88,7 +92,9 @@ class NumpyActor:
         """log π(a|s) of all ``n_steps`` steps, shape ``(n_steps * n_envs,)``."""
         outputs = th.as_tensor(np.concatenate(self.outputs))
         rows = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
-        return distribution_of(self.policy, outputs, self.distribution).log_prob(rows).cpu().numpy()
+        log_std = [th.as_tensor(np.concatenate(self.log_stds))] if self.log_stds else []
+        log_prob: th.Tensor = self.distribution.proba_distribution(outputs, *log_std).log_prob(rows)
+        return log_prob.numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         # A hook or a replaced method adds an entry to a dict; other parts and parameters are other objects

@@ -111,12 +111,14 @@ def collect(
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
-        if is_attached:
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return None
-        # After the callback, which finds s_t there, as with A2C
-        model._last_obs = new_obs  # type: ignore[assignment]
+        try:
+            if is_attached:
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    return None
+        finally:
+            # The callback finds s_t there, as with A2C; what it fails on may be s_{t+1}
+            model._last_obs = new_obs  # type: ignore[assignment]
         model._last_episode_starts = dones
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards

@@ -247,6 +247,23 @@ def test_the_lab_takes_it(network):
     RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=4, baseline="optimal", device="cpu").learn(40)
 
 
+def test_cudnn_is_not_asked_for_gradients_in_evaluation_mode(monkeypatch):
+    """Which it cannot compute; where there is no dropout, the memory is in training mode all the time."""
+    passes = []
+    forward = th.nn.LSTM.forward
+
+    def recorded(self, *inputs):
+        is_differentiated = th.is_grad_enabled() and not self.training
+        passes.append((is_differentiated, th.backends.cudnn.enabled))
+        return forward(self, *inputs)
+
+    monkeypatch.setattr(th.nn.LSTM, "forward", recorded)
+    network = {"lstm_kwargs": {"dropout": 0.5}, "n_lstm_layers": 2}
+    model = make_recurrent(double=False, n_episodes=4, baseline="optimal", policy_kwargs=network).learn(20)
+    compare_baselines(model, n_episodes=4, n_resamples=2)
+    assert (True, False) in passes and (True, True) not in passes
+
+
 class OneStep(MlpLstmPolicy):
     """Overrides what is called for single steps alone."""
 

@@ -74,17 +74,24 @@ def test_advantages_are_normalized_over_all_groups():
     th.testing.assert_close(normalized, (raw - raw.mean()) / raw.std())
 
 
-def test_the_same_seed_gives_the_same_run_and_a_saved_model_goes_on(tmp_path):
+@pytest.mark.parametrize("task", [Scales, "FrozenLake-v1"])
+def test_the_same_seed_gives_the_same_run_and_a_saved_model_goes_on(task, tmp_path):
+    """Also where all episodes have the same first observation."""
+
     def run():
-        env = make_vec_env(Scales, 8, seed=0)
+        env = make_vec_env(task, 8, seed=0)
         return REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0).learn(80)
 
     first, second = run(), run()
     assert plain(first.policy.state_dict()) == plain(second.policy.state_dict())
     first.save(tmp_path / "model")
-    loaded = REINFORCE.load(tmp_path / "model", env=first.env)
+    loaded = REINFORCE.load(tmp_path / "model", env=make_vec_env(task, 8), restore_random_state=True)
     assert loaded.episodes_per_start == 2
-    loaded.learn(16)
+    for model in (first, loaded):
+        th.manual_seed(1)
+        model.env.seed(1)
+        model.learn(80, reset_num_timesteps=False)
+    assert plain(loaded.policy.state_dict()) == plain(first.policy.state_dict())
 
 
 def test_dicts_are_compared_key_by_key():
@@ -160,6 +167,19 @@ def test_after_training_the_environments_are_independent_again(name, end):
     env = make_vec_env("Pendulum-v1", 4, seed=0)
     MODELS_THAT_SHARE_STARTS[name](env).learn(1, At(end) if end > 1 else None)
     assert len(np.unique(env.reset(), axis=0)) == 4
+
+
+class Unseeded(DummyVecEnv):
+    def seed(self, seed=None):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("name", MODELS_THAT_SHARE_STARTS)
+def test_a_vec_env_need_not_be_seeded(name):
+    env = Unseeded([lambda: gym.make("Pendulum-v1")] * 4)
+    model = MODELS_THAT_SHARE_STARTS[name](make_vec_env("Pendulum-v1", 4))
+    model.set_env(env)
+    model.learn(1)
 
 
 def test_memory_takes_one_episode_of_each_environment():

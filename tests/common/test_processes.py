@@ -22,6 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_reinforce import FiniteDifference
 from sb3_reinforce.common import processes
 from sb3_reinforce.common.distribution import seen_since
 from sb3_reinforce.common.processes import ProcessError, Processes
@@ -297,6 +298,16 @@ def observations_of_all(rank):
     model.env.step(np.zeros(1, dtype=int))
     model.learn(1, reset_num_timesteps=False)
     return model.rollout_buffer.observations.argmax(-1).T.tolist()
+
+
+def test_after_common_starts_the_environments_of_all_processes_are_independent(tmp_path):
+    def learn(rank):
+        env = make_vec_env("Pendulum-v1", 4, seed=0)
+        FiniteDifference("LinearPolicy", env, seed=0, device="cpu").learn(1)
+        return env.reset()
+
+    first, second = in_processes(2, learn, tmp_path)
+    assert len(np.unique(np.concatenate([first, second]), axis=0)) == 8
 
 
 def test_whole_episodes_begin_with_a_reset_in_all_processes(tmp_path):

@@ -11,6 +11,7 @@ import threading
 import warnings
 import zipfile
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from unittest import mock
 
@@ -258,6 +259,27 @@ def test_the_states_of_other_optimizers_are_loaded(optimizer, kind, tmp_path):
     loaded = type(model).load(tmp_path / "model", env=Corridor())
     assert plain(loaded.get_parameters()) == plain(model.get_parameters())
     loaded.learn(32)
+
+
+@both
+@pytest.mark.parametrize(
+    ("own", "other"),
+    [
+        *product((th.optim.SGD, th.optim.Adagrad), (th.optim.Adam, th.optim.RMSprop, th.optim.Adamax)),
+        *product((th.optim.Adam,), (th.optim.SGD, th.optim.Adagrad, th.optim.Adamax)),
+    ],
+)
+def test_the_state_of_another_kind_of_optimizer_is_left_out(own, other, kind):
+    def make_with(optimizer):
+        return make(kind, Corridor(), policy_kwargs={"net_arch": [4], "optimizer_class": optimizer})
+
+    states = make_with(other).learn(32).get_parameters()
+    model = make_with(own)
+    with pytest.raises(ValueError, match="another optimizer"):
+        model.set_parameters(states)
+    with pytest.warns(UserWarning, match="It is left out"):
+        model.set_parameters(states, exact_match=False)
+    model.learn(32)
 
 
 @both

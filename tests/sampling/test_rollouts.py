@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.estimation import BASELINES
 
 CUTS = "ignore:Episodes that n_steps cuts"
@@ -140,23 +141,22 @@ def test_the_buffer_is_that_of_a2c():
     make_model("CartPole-v1", 3, n_steps=12).learn(36, callback=Record(check))
 
 
+@pytest.mark.parametrize("task", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ELU])
-def test_log_probs_are_those_of_the_policy_that_acted(activation_fn):
+def test_log_probs_are_those_of_the_policy_that_acted(activation_fn, task):
     """Also where a callback changes its parameters in place during the rollout."""
 
     def change(model):
+        buffer, step = model.rollout_buffer, len(log_probs)
+        actions = as_policy_actions(th.as_tensor(buffer.actions[step]), model.action_space)
         with th.no_grad():
-            log_probs.append(model.policy.get_distribution(obs_of(model)).log_prob(actions_of(model)))
+            log_probs.append(model.policy.get_distribution(th.as_tensor(buffer.observations[step])).log_prob(actions))
             model.policy.action_net.weight.normal_()
-
-    def obs_of(model):
-        return th.as_tensor(model.rollout_buffer.observations[len(log_probs)])
-
-    def actions_of(model):
-        return th.as_tensor(model.rollout_buffer.actions[len(log_probs)]).flatten()
+            if task == "Pendulum-v1":
+                model.policy.log_std.normal_()
 
     log_probs = []
-    model = make_model("CartPole-v1", 2, n_steps=8, policy_kwargs={"activation_fn": activation_fn})
+    model = make_model(task, 2, n_steps=8, policy_kwargs={"activation_fn": activation_fn})
     model.learn(16, Record(change, "step"))
     np.testing.assert_allclose(model.rollout_buffer.log_probs, th.stack(log_probs), rtol=1e-4, atol=1e-6)
 
