@@ -57,7 +57,7 @@ def compare_baselines(
     constant for each single component of the gradient, fitted to these episodes. No scalar constant has a smaller
     variance; a baseline that depends on the time or the state can.
 
-    With an MlpPolicy, all names together cost one to two plain forward and backward passes over the episodes, which
+    With an MlpPolicy, all names together cost a few forward and backward passes over the episodes, which
     ``examples/benchmarks/comparison_cost.py`` measures.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
