@@ -59,6 +59,15 @@ def seconds() -> str:
     return markdown(["task", "REINFORCE", "A2C", "PPO"], lines)
 
 
+def machines() -> str:
+    """The same seeds on an earlier and on a later machine, where the returns differ."""
+    lines = [
+        [f"{task} ({short(budget)})", *(counted(runs[column]) for column in ("earlier", "later"))]
+        for task, budget, runs in by_task(read("machines"))
+    ]
+    return markdown(["task (steps)", "earlier machine [seeds]", "later machine"], lines)
+
+
 def searches() -> str:
     """FiniteDifference and ARS by the comparison's own protocol."""
     rows = final("comparison_others")
@@ -228,7 +237,7 @@ def processes_model() -> str:
 def all_tables() -> dict[str, str]:
     """What pages write as ``{{ name }}``."""
     functions = (
-        comparison, natural, seconds, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
+        comparison, natural, seconds, machines, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
         common_random_numbers, noise_scale, search_throughput, throughput, images, peers, processes, processes_model,
     )  # fmt: skip
     return {function.__name__: function() for function in functions}

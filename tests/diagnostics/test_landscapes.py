@@ -12,9 +12,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, landscape
+from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, estimator_comparison, landscape
 from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
+from sb3_reinforce.diagnostics.tables import Estimate
 
 
 def bandit(algorithm=REINFORCE, **kwargs):
@@ -64,6 +65,14 @@ def test_all_estimators_see_the_same_gradient(algorithm):
     assert [table[name].steps >= evaluations for name, evaluations in (("forward", 17), ("central", 32))] == [True] * 2
     assert table["likelihood_ratio"].snr_per_step.low > 0
     assert set(table.legend) == {*table.columns[1:], "[a, b]"}
+
+
+def test_the_signal_to_noise_ratio_is_per_step(monkeypatch):
+    figures = Estimate(0.5, 0.4, 0.6), Estimate(6.0, 3.0, 9.0)
+    monkeypatch.setattr(estimator_comparison, "compare_to_reference", lambda *_: figures)
+    (row,) = compare_estimators(bandit(), 10, 3, "central")
+    found = (row.snr_per_step.value, row.snr_per_step.low, row.snr_per_step.high)
+    assert row.steps > 1 and found == pytest.approx((6 / row.steps, 3 / row.steps, 9 / row.steps))
 
 
 def test_by_default_every_estimator_sees_something_on_cartpole():
@@ -142,8 +151,10 @@ def test_every_picture_can_be_saved(tmp_path):
         assert drawn[y].get_xdata() == [row.ratio.value]
         assert (drawn[y].get_markerfacecolor() == "white") == (row.bias != 0)
     save(ax, tmp_path / "baselines.png")
-    ax = plots.plot_learning_curves({"a": np.random.rand(5, 8), "b": np.random.rand(4, 3, 8)}, np.arange(8))
+    scores = np.random.rand(5, 8)
+    ax = plots.plot_learning_curves({"a": scores, "b": np.random.rand(4, 3, 8)}, np.arange(8))
     assert [line.get_label() for line in ax.get_lines()] == ["a (5 runs)", "b (4 runs)"]
+    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), plots.interquartile_mean(scores))
     save(ax, tmp_path / "curves.png")
     fans = {"one": th.ones(4), "three": th.randn(3, 4)}
     found = landscape(bandit(), fans, n_points=3, n_episodes=2, progress_bar=True)
