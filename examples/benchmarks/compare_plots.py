@@ -24,7 +24,6 @@ from scipy.stats import trim_mean
 from sb3_reinforce.diagnostics.plots import COLOURS
 
 REPETITIONS = 2000
-CLOCKS = {"cpu_seconds": "seconds of a core", "seconds": "seconds of training"}
 LABELS = {
     "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
     "trpo": "TRPO",
@@ -68,21 +67,22 @@ def iqm_of_points(scores: np.ndarray) -> np.ndarray:
     return trim_mean(scores.reshape(-1, scores.shape[-1]), proportiontocut=0.25, axis=0)
 
 
-def draw_curves(results: pd.DataFrame, clock: str) -> None:
+def draw_curves(results: pd.DataFrame) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
     n_rows = (len(tasks) + 1) // 2
     figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
     pairs = grid.reshape(-1, 2)
     for axes, ((task, budget), runs) in zip(pairs, tasks, strict=False):
-        timed = runs[runs["seed"].isin(set.intersection(*(set(each) for _, each in runs.groupby("algorithm")["seed"])))]
-        for axis, column, drawn in zip(axes, ("steps", clock), (runs, timed), strict=True):
+        common = set.intersection(*(set(mine["seed"]) for _, mine in runs.groupby("algorithm")))
+        timed = runs[runs["seed"].isin(common)]
+        for axis, column, drawn in zip(axes, ("steps", "cpu_seconds"), (runs, timed), strict=True):
             for algorithm, mine in drawn.groupby("algorithm", sort=False):
-                end = budget if column == "steps" else mine[mine["evaluation"] == "final"][clock].median()
+                end = budget if column == "steps" else mine[mine["evaluation"] == "final"][column].median()
                 points, iqm, (low, high) = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
         axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
-        axes[1].set(title=task, xlabel=CLOCKS[clock], xscale="symlog")
+        axes[1].set(title=task, xlabel="seconds of a core", xscale="symlog")
     for axis in pairs[len(tasks) :].flat:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task
@@ -156,10 +156,10 @@ def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[st
     axis.invert_yaxis()
 
 
-def table(results: pd.DataFrame, clock: str) -> str:
+def table(results: pd.DataFrame) -> str:
     """The final evaluations: median over the seeds, least and greatest, and the median of the seconds."""
     lines = [
-        f"| task (steps) | algorithm | seeds | return: median (least, greatest) | {CLOCKS[clock]} |",
+        "| task (steps) | algorithm | seeds | return: median (least, greatest) | seconds of a core |",
         "|---|---|---|---|---|",
     ]
     final = results[results["evaluation"] == "final"]
@@ -167,7 +167,7 @@ def table(results: pd.DataFrame, clock: str) -> str:
         returns = runs["return"]
         lines.append(
             f"| {task} ({budget:,}) | {LABELS.get(algorithm, algorithm)} | {len(runs)} | "
-            f"{returns.median():.1f} ({returns.min():.1f}, {returns.max():.1f}) | {runs[clock].median():.0f} |"
+            f"{returns.median():.1f} ({returns.min():.1f}, {returns.max():.1f}) | {runs['cpu_seconds'].median():.0f} |"
         )
     return "\n".join(lines)
 
@@ -176,7 +176,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="CSVs that compare.py has written")
     parser.add_argument("--output", type=Path, required=True, help="path of the pictures, without suffix")
-    parser.add_argument("--clock", default="cpu_seconds", choices=list(CLOCKS))
     arguments = parser.parse_args()
     matplotlib.use("agg")
     results = pd.concat(pd.read_csv(path) for path in arguments.results)
@@ -186,8 +185,8 @@ def main() -> None:
         key=lambda column: column.map(order.index) if column.name == "algorithm" else column,
         kind="stable",
     )
-    print(table(results, arguments.clock))
-    draw_curves(results, arguments.clock)
+    print(table(results))
+    draw_curves(results)
     plt.savefig(arguments.output.with_name(f"{arguments.output.name}_curves.png"), dpi=120)
     scores = final_scores(results)
     if not scores:

@@ -26,7 +26,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     env = cast(VecEnv, model.env)
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
-    if getattr(model, "episodes_per_start", 1) > 1:
+    if getattr(model, "shares_starts", False):
         separate(env)
     with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
         yield

@@ -73,6 +73,10 @@ def test_peers_use_the_settings_of_another_version_and_searches_may_have_none():
     assert model.learn(64).num_timesteps >= 64
 
 
+def test_algorithms_off_the_policy_have_the_noise_of_their_settings():
+    assert compare.make(compare.Run("Pendulum-v1", "td3", 0, 300))[0].action_noise is not None
+
+
 def test_settings_of_an_atari_game():
     pytest.importorskip("ale_py")
     have_settings = {name for name in compare.ALGORITHMS if compare.settings_of(name, "ALE/Pong-v5")}
