@@ -166,6 +166,7 @@ class FiniteDifference(BasePolicyGradient):
         self.policy = policy.to(self.device)
         if policy_class in (ActorCriticPolicy, LinearPolicy):
             self._maybe_recommend_cpu(policy_class.__name__)
+        # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, n_parameters)
@@ -226,7 +227,7 @@ class FiniteDifference(BasePolicyGradient):
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
-        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        check_learn(self, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

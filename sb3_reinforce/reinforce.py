@@ -255,7 +255,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         warn_of_own_methods(self.rollout_buffer)
         optimization.fuse(self.policy.optimizer)
         self._make_critic_optimizer()
-        self._sorted_parameters: tuple[Any, ...] = ()
+        self._present_parameters: tuple[tuple[int, bool], ...] = ()
+        self._parameter_groups: tuple[Parameters, Parameters, Parameters] = ([], [], [])
         self._scheduled("ent_coef")
         self._apply_temperature_and_floor()
 
@@ -273,14 +274,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if rollout.values is None:
             return trainable(self.policy), [], []
         present = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
-        if self._sorted_parameters[:1] != (present,):
+        if self._present_parameters != present:
             held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
             if not held >= {number for number, _ in present}:
                 self._make_critic_optimizer()
             self.policy.set_training_mode(False)
-            self._sorted_parameters = (present, split_parameters(self.policy, batch.observations, batch.actions))
-        groups: tuple[Parameters, Parameters, Parameters] = self._sorted_parameters[1]
-        return groups
+            self._parameter_groups = split_parameters(self.policy, batch.observations, batch.actions)
+            self._present_parameters = present
+        return self._parameter_groups
 
     def _apply_temperature_and_floor(self) -> None:
         set_temperature(self.policy, self._scheduled("temperature"))
@@ -356,7 +357,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
         """Reset the environments where the next rollout does not continue their episodes."""
-        if self.episodes_per_start > 1:
+        if self.shares_starts:
             self._last_obs = None
             self._last_obs = start_groups(env, self.episodes_per_start)
         # A measurement that failed in a callback leaves no observation
@@ -495,7 +496,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def sampling_copy(self, n_episodes: int, baseline: str | Baseline | None = None) -> "REINFORCE":
         """
-        A copy for measurements: it shares policy and environments, and has a log, counters and rollouts apart.
+        A copy for measurements: it shares policy and environments, with its own log, counters and rollouts.
 
         :param n_episodes: Whole episodes per rollout
         :param baseline: Its baseline; None for ``"value"`` with a critic, else ``"none"``
@@ -541,11 +542,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
-        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, or processes under
-            torchrun have different arguments
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, processes under torchrun
+            have different arguments, or what ``collect_rollouts`` and ``train`` refuse
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
-        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        check_learn(self, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -558,7 +559,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_sorted_parameters", "rollout", "is_collecting"]
+        own = ["_present_parameters", "_parameter_groups", "rollout", "is_collecting"]
+        return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

@@ -154,15 +154,17 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
     check_function("baseline", model.baseline, baselines)
-    shares_starts = model.episodes_per_start > 1
     if model.n_steps is None and model.n_episodes is None:
-        model.n_steps = 32 if model.has_critic and not shares_starts else None
+        model.n_steps = 32 if model.has_critic and not model.shares_starts else None
         if model.n_steps is None:
-            model.n_episodes = model.n_envs * place()[1] if shares_starts else 16
+            n_envs = model.n_envs * place()[1]
+            model.n_episodes = n_envs if model.shares_starts else max(16, n_envs)
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
-    if model.n_episodes == 1 and model.baseline in ("time_mean", "leave_one_out", "optimal"):
+    compares_episodes = model.baseline in ("time_mean", "leave_one_out", "optimal")
+    # For episodes that share their start, check_starts says what is allowed
+    if model.n_episodes == 1 and compares_episodes and not model.shares_starts:
         reason = f"baseline={model.baseline!r}, which compares episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
@@ -186,8 +188,8 @@ def check_starts(model: Any) -> None:
         return
     if model.n_steps is not None or model.n_episodes != n_episodes or model.n_envs % m:
         raise ValueError(
-            f"episodes_per_start={m} needs one whole episode of each environment, n_episodes={n_episodes}, and a "
-            f"multiple of {m} environments: got n_steps={model.n_steps}, n_episodes={model.n_episodes} and "
+            f"episodes_per_start={m} needs one whole episode of each environment, n_episodes={n_episodes} or None, and "
+            f"a multiple of {m} environments: got n_steps={model.n_steps}, n_episodes={model.n_episodes} and "
             f"{model.n_envs} environments"
         )
     if model.baseline in ("none", "mean", "value"):
@@ -212,9 +214,11 @@ def check_finite_difference(model: Any, estimators: Functions, perturbations: Fu
         raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
 
 
-def check_learn(env: Any, *arguments: Any) -> None:
+def check_learn(model: Any, *arguments: Any) -> None:
     """Check the arguments of ``learn``, in their order."""
-    if env is None:
+    if model.env is None:
         raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
+    if model.is_collecting:
+        raise ValueError("learn cannot be called while the model collects a rollout: a callback can stop the training")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

@@ -66,9 +66,7 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.set_xlim(left=0)
-    # The ratio of the reference to itself is 1 in every resample
-    (reference, *_) = (row.baseline for row in rows if row.ratio.low == row.ratio.high == 1)
-    ax.set(xlabel=f"variance / variance of {reference}")
+    ax.set(xlabel=table.legend["ratio"])
     ax.set_title(table.title.replace(" (", "\n("))
     bars = f"lines: {table.legend['[a, b]'].partition(';')[0]}s"
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False, title=bars)
@@ -155,12 +153,18 @@ def plot_variances(
     :param ax: Axes to draw on; None for new ones
     :param confidence: Probability with which an interval should cover the true value
     :return: The Axes
+    :raises ValueError: If there are fewer than two repetitions, or the shapes do not match
     """
     ax = new_axes(ax)
     x = np.asarray(n_episodes, dtype=float)
     width = NormalDist().inv_cdf((1 + check_number("confidence", confidence, 0, 1)) / 2)
     for index, (name, given) in enumerate(curves.items()):
         variances = np.asarray(given, dtype=float)
+        if variances.ndim != 2 or len(variances) < 2 or variances.shape[1:] != x.shape:
+            raise ValueError(
+                f"curves[{name!r}] must be of shape (n_repetitions, n_points), with at least 2 repetitions and "
+                f"n_points = {x.size}, got {variances.shape}"
+            )
         error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
         shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
         colour = COLOURS[index % len(COLOURS)]
@@ -168,7 +172,7 @@ def plot_variances(
         mean = variances.mean(axis=0)
         ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance (trace of the covariance)")
-    ax.set_title(f"Variance of the gradient: mean of {len(variances)} repetitions")
+    ax.set_title("Variance of the gradient: means of the repetitions")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
     ax.xaxis.set_minor_locator(NullLocator())
     ax.grid(axis="y", alpha=0.3)

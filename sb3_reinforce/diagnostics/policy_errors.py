@@ -14,6 +14,7 @@ from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
 from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy, trainable
+from sb3_reinforce.policies.parameters import write
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
@@ -90,9 +91,9 @@ def values_at(thetas: th.Tensor, parameters: Parameters, function: Callable[[], 
     before = to_vector(parameters)
     values = []
     for theta in thetas:
-        th.nn.utils.vector_to_parameters(theta, parameters)
+        write(parameters, theta)
         values.append(function())
-    th.nn.utils.vector_to_parameters(before, parameters)
+    write(parameters, before)
     return th.stack(values)
 
 

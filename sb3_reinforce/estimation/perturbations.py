@@ -34,7 +34,7 @@ def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
     """
     deltas = []
     for first in range(0, k, n):
-        rows = th.eye(n, dtype=th.float64)[th.randperm(n, generator=generator)][: k - first]
+        rows = th.nn.functional.one_hot(th.randperm(n, generator=generator)[: k - first], n).double()
         deltas.append(rows if (first // n) % 2 == 0 else -rows)
     return th.cat(deltas)
 

@@ -410,6 +410,20 @@ def test_a_critic_without_parameters():
     assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
 
 
+@all_kinds
+def test_a_callback_cannot_train_the_model_that_collects_its_rollout(kind):
+    model = make(kind, "CartPole-v1")
+    with pytest.raises(ValueError, match="learn cannot be called while the model collects a rollout"):
+        model.learn(8, Record(lambda model: model.learn(8), at="step"))
+    assert model.learn(8).num_timesteps >= 8
+
+
+@pytest.mark.parametrize(("n_envs", "n_episodes"), [(1, 16), (20, 20)])
+def test_by_default_each_environment_has_an_episode(n_envs, n_episodes):
+    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", n_envs), baseline="none", device="cpu")
+    assert model.n_episodes == n_episodes
+
+
 def test_what_a_callback_sets_is_used():
     values = {"ent_coef": 1e6, "temperature": 3.0, "gamma": 0.5}
     model = make("steps", max_grad_norm=None).learn(32, callback=At(8, lambda model: vars(model).update(values)))

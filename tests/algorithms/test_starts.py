@@ -119,6 +119,8 @@ def test_what_cannot_share_its_start_is_refused():
     for kwargs in ({"n_episodes": 16}, {"n_steps": 8}, {"episodes_per_start": 3}):
         with pytest.raises(ValueError, match=r"episodes_per_start=. needs one whole episode of each environment"):
             REINFORCE("MlpPolicy", env, **{"baseline": "leave_one_out", "episodes_per_start": 4, **kwargs})
+    with pytest.raises(ValueError, match=r"a multiple of 2 environments: got .* and 1 environments"):
+        REINFORCE("MlpPolicy", Scales(), baseline="leave_one_out", episodes_per_start=2)
     with pytest.raises(ValueError, match="compares the episodes of a start"):
         REINFORCE("MlpPolicy", env, episodes_per_start=4)
 

@@ -216,3 +216,11 @@ def test_the_table_says_what_its_columns_are():
     table = check_gradient(REINFORCE("MlpPolicy", corridor(ACTION_SPACES[0]), device="cpu"), 2)
     below = str(table).splitlines()[len(table) + 2 :]
     assert all(column in "\n".join(below) for column in table.columns[1:])
+
+
+def test_the_parameters_stay_where_they_are_in_memory():
+    """In one common storage, each saved parameter would take the bytes of all."""
+    model = REINFORCE("MlpPolicy", Tree(), device="cpu")
+    addresses = [parameter.data_ptr() for parameter in model.policy.parameters()]
+    check_gradient(model)
+    assert [parameter.data_ptr() for parameter in model.policy.parameters()] == addresses

@@ -34,6 +34,11 @@ def test_norms():
     assert set(rademacher(9, 6, generator()).unique().tolist()) == {-1.0, 1.0}
 
 
+def test_a_few_coordinates_of_many_take_little_memory():
+    deltas = coordinate(2, 300_000, generator())
+    assert deltas.abs().sum(1).tolist() == [1.0, 1.0]
+
+
 def test_coordinates_visit_all_parameters_with_alternating_sign():
     deltas = coordinate(10, 4, generator())
     for rows, sign in ((deltas[:4], 1), (deltas[4:8], -1)):
