@@ -11,7 +11,7 @@ from sb3_reinforce.common.arguments import check_choice, check_function, check_i
 from sb3_reinforce.diagnostics.sampling import check_model, sample, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise, variance
 from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resamples
-from sb3_reinforce.estimation.baselines import BASELINES, Baseline, ratio_of_others
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, parameters_of
 from sb3_reinforce.estimation.weights import check_baseline
@@ -110,7 +110,7 @@ def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -
                 "'value' out, or train a model with baseline='value'"
             )
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
-        rows = {"optimal": BASELINES["optimal"], "floor": None, **functions}
+        rows = {"floor": None, **functions}
         if rows.get(name, function) is not function:
             raise ValueError(f"baselines must have names that differ, and {name!r} is the name of another row")
         functions[name] = function
@@ -124,12 +124,10 @@ def baseline_rows(
     weights = {}
     seconds = {"floor": float("nan")}
     for name, function in functions.items():
-        if function is not BASELINES["optimal"]:
-            begin = time.perf_counter()
-            weights[name] = weights_by(function, rollout)
-            seconds[name] = time.perf_counter() - begin
-    grams, seconds["optimal"] = gram_matrices(rollout, weights)
-    moments = {name: compute_moments(grams[name], counts) for name in (*functions, "floor")}
+        begin = time.perf_counter()
+        weights[name] = weights_by(function, rollout)
+        seconds[name] = time.perf_counter() - begin
+    moments = {name: compute_moments(products, counts) for name, products in gram_matrices(rollout, weights).items()}
     return [
         BaselineRow(
             baseline=name,
@@ -161,31 +159,15 @@ def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
     return 1 / len(lengths) if own_return_in_mean else float("nan")
 
 
-def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> tuple[dict[str, th.Tensor], float]:
-    """
-    ``K_ij = ⟨g_i, g_j⟩`` (m, m) for weights (n_steps, n_envs) by baseline, ``"none"`` first, for ``"optimal"`` and for
-    the ``"floor"``; and the seconds for ``A = Σ_t γ^t ∇log π G_t`` and ``S = Σ_t γ^t ∇log π``.
-
-    The optimal baseline b leaves A − b S, so that its K follows from the products of A and S.
-    """
+def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
+    """``K_ij = ⟨g_i, g_j⟩`` (m, m) for weights (n_steps, n_envs) by baseline, ``"none"`` first, and the ``"floor"``."""
     n_episodes = len(th.unique(rollout.episodes[rollout.used]))
-    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in (*weights, "A S", "S S", "floor")}
-    seconds = 0.0
-    begin = time.perf_counter()
+    found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in (*weights, "floor")}
     for scores, *gradients in gradient_blocks(rollout, rollout.discounts, *weights.values()):
-        seconds += (time.perf_counter() - begin) * 2 / (1 + len(gradients))
         for name, each in zip(weights, gradients, strict=True):
             found[name] += gram(each)
-        found["A S"] += gram(gradients[0], scores)
-        found["S S"] += gram(scores)
         found["floor"] += gram(componentwise_residuals(gradients[0], scores))
-        begin = time.perf_counter()
-    a_s, s_s = found.pop("A S"), found.pop("S S")
-    # As the baseline itself computes it, from the products that are already here
-    b = ratio_of_others(a_s.diagonal(), s_s.diagonal())
-    # ⟨A_i − b_i S_i, A_j − b_j S_j⟩
-    found["optimal"] = found["none"] - a_s * b - (a_s * b).T + s_s * b * b[:, None]
-    return found, seconds
+    return found
 
 
 def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:

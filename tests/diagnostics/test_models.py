@@ -197,7 +197,7 @@ MISTAKES = {
         ({"baselines": (lambda r: r.returns, lambda r: 0 * r.returns)}, "'<lambda>' is the name of another row"),
         ({"baselines": called("none")}, "'none' is the name of another row"),
         ({"baselines": called("floor")}, "'floor' is the name of another row"),
-        ({"baselines": called("optimal")}, "'optimal' is the name of another row"),
+        ({"baselines": ["optimal", called("optimal")]}, "'optimal' is the name of another row"),
         ({"baselines": (3,)}, "baselines must be a name or a callable, got 3"),
         ({"baselines": ("value",)}, "no critic.*'none'"),
         ({"reference": "optimal", "baselines": ("mean",)}, r"reference must be.*'none', 'mean'.*got 'optimal'"),
