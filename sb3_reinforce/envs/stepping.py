@@ -5,17 +5,15 @@ With 64 CartPoles the deep copies of ``DummyVecEnv.step_wait`` take a fourth of 
 """
 
 from copy import deepcopy
-from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
 
-from sb3_reinforce.envs.checks import BadData, as_reward, check_observation
+from sb3_reinforce.envs.checks import as_reward, check_observation
 
 
 def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
@@ -29,11 +27,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     form = (rows.dtype, rows.shape[1:])
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
-        try:
-            obs, reward, terminated, truncated, info = single.step(action)
-        except (TypeError, ValueError) as error:
-            check_monitor(error, i)
-            raise
+        obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         info = {**info, "TimeLimit.truncated": truncated and not terminated}
         if terminated or truncated:
@@ -49,14 +43,6 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
         infos.append(info)
     env.buf_infos = infos
     return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
-
-
-def check_monitor(error: Exception, i: int) -> None:
-    """Name the reward of environment ``i`` where ``Monitor`` could not add it up."""
-    *_, (frame, _) = walk_tb(error.__traceback__)
-    if frame.f_code is Monitor.step.__code__:
-        reward = frame.f_locals.get("reward")
-        raise BadData(f"The reward of environment {i} must be a number, got {reward!r}: {error}") from error
 
 
 def reset(env: DummyVecEnv) -> VecEnvObs:

@@ -205,14 +205,6 @@ def test_rewards_that_are_no_numbers(wrapper, value, kind):
         model.learn(400)
 
 
-@all_kinds
-@pytest.mark.parametrize("value", ["x", OF_ONE, np.ones(2), None], ids=repr)
-def test_rewards_that_monitor_cannot_add_up(value, kind):
-    env = DummyVecEnv([lambda: Monitor(Faulty()), lambda: Monitor(Faulty("reward", 5, value))])
-    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number, got .*\(step 4 since"):
-        make(kind, env).learn(400)
-
-
 @bare_or_normalized
 @pytest.mark.parametrize("kind", ["steps", "episodes"])
 def test_actions_that_are_not_finite_are_not_blamed_on_the_environment(kind, wrapper):
