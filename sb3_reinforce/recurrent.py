@@ -52,7 +52,7 @@ class RecurrentREINFORCE(REINFORCE):
         >>> action, state = model.predict(obs, state, episode_start)  # doctest: +SKIP
 
     :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy, MaskedLstmPolicy or a subclass of one of them
-    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: Of the policy, and of the critic unless ``critic_learning_rate`` is given; a schedule too
     :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
     :param n_episodes: Whole episodes per rollout; 16 if ``n_steps`` is None too

@@ -19,9 +19,8 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from rliable import library, metrics
-from scipy.stats import trim_mean
 
-from sb3_reinforce.diagnostics.plots import COLOURS
+from sb3_reinforce.diagnostics.plots import COLOURS, interquartile_interval
 
 REPETITIONS = 2000
 LABELS = {
@@ -54,17 +53,11 @@ REFERENCES = {
 }
 
 
-def curve(runs: pd.DataFrame, column: str, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def curve(runs: pd.DataFrame, column: str, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The interquartile mean of runs and its interval, on 50 points from 0 to ``end`` of a column."""
     points = np.linspace(0, end, 50)
     scores = np.array([np.interp(points, run[column], run["return"]) for _, run in runs.groupby("seed")])
-    iqm, interval = library.get_interval_estimates({"": scores[:, None]}, iqm_of_points, reps=REPETITIONS)
-    return points, iqm[""], interval[""]
-
-
-def iqm_of_points(scores: np.ndarray) -> np.ndarray:
-    """The interquartile mean at each point, of scores of shape ``(n_runs, n_tasks, n_points)``, in one call."""
-    return trim_mean(scores.reshape(-1, scores.shape[-1]), proportiontocut=0.25, axis=0)
+    return points, *interquartile_interval(scores[:, None], REPETITIONS, 0.95, seed=0)
 
 
 def draw_curves(results: pd.DataFrame) -> None:
@@ -78,7 +71,7 @@ def draw_curves(results: pd.DataFrame) -> None:
         for axis, column, drawn in zip(axes, ("steps", "cpu_seconds"), (runs, timed), strict=True):
             for algorithm, mine in drawn.groupby("algorithm", sort=False):
                 end = budget if column == "steps" else mine[mine["evaluation"] == "final"][column].median()
-                points, iqm, (low, high) = curve(mine, column, end)
+                points, iqm, low, high = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
         axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))

@@ -44,14 +44,14 @@ def finite_norm(gradient: th.Tensor, name: str, remedy: str) -> float:
 def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parameter], name: str) -> Iterator[None]:
     """Roll the parameters back if any of them is not finite when the block ends, and clear the optimizer's state."""
     # Finite gradients can do that: Adam without its eps divides 0 by 0, and weight decay may be too large
-    before = to_vector(parameters)
+    before = [parameter.detach().clone() for parameter in parameters]
     try:
         yield
     finally:
         if not math.isfinite(th.linalg.vector_norm(to_vector(parameters), ord=math.inf)):
             with th.no_grad():
-                for parameter, old in zip(parameters, th.split(before, [p.numel() for p in parameters]), strict=True):
-                    parameter.copy_(old.view_as(parameter))
+                for parameter, old in zip(parameters, before, strict=True):
+                    parameter.copy_(old)
             optimizer.state.clear()
             raise ValueError(
                 f"A step made a parameter of the {name} that is not finite. The parameters are those before it, and "

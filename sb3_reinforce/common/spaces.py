@@ -15,7 +15,7 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 
 
 def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
-    """Return the environment, made if it is an id, if a policy can act in it and it has ``n_envs`` copies."""
+    """Make the environment if it is an id, and check its spaces and its number of copies."""
     vectorized = isinstance(env, gym.vector.VectorEnv)
     if vectorized or not (isinstance(env, str) or hasattr(env, "observation_space")):
         hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if vectorized else ""
@@ -60,14 +60,11 @@ def check_space(name: str, space: spaces.Space[Any], supported: str) -> None:
         raise ValueError(f"The {name} must not be empty, got {space}")
 
 
-def env_actions_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[np.ndarray], np.ndarray]:
+def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarray]:
     """Return the map from the policy's actions to the environment's, both ``(n_envs, *action_space.shape)``."""
     space = policy.action_space
     if isinstance(space, spaces.Box):
-        # To broadcast the bounds at each step would take longer than to clip
-        low = np.repeat(space.low[None], n_envs, axis=0)
-        high = np.repeat(space.high[None], n_envs, axis=0)
-        return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(low, high)
+        return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(space.low, space.high)
     if np.any(getattr(space, "start", 0)):
         return lambda actions: shift_to_start(space, actions)
     return lambda actions: actions

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -152,6 +151,10 @@ def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Ten
     Without it, the scale of a layer, which a later layer can undo, would determine how steep the landscape looks.
     """
     parts = th.split(direction, [parameter.numel() for parameter in like])
-    filters = [(d.reshape(len(p) if p.dim() > 1 else 1, -1), p) for d, p in zip(parts, like, strict=True)]
-    norm = partial(th.linalg.vector_norm, dim=1, keepdim=True)
-    return th.cat([(d / norm(d) * norm(p.detach().cpu().double().reshape(d.shape))).flatten() for d, p in filters])
+    scaled = []
+    for d, parameter in zip(parts, like, strict=True):
+        n_filters = len(parameter) if parameter.dim() > 1 else 1
+        d = d.reshape(n_filters, -1)
+        filters = parameter.detach().cpu().double().reshape(n_filters, -1)
+        scaled.append((d / d.norm(dim=1, keepdim=True) * filters.norm(dim=1, keepdim=True)).flatten())
+    return th.cat(scaled)

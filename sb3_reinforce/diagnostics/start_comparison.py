@@ -106,7 +106,7 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
 
 
 def by_start(parts: list[th.Tensor]) -> th.Tensor:
-    """Rows ``(n_steps, n_envs)`` of all rollouts, with zeros behind their end, by start: ``(n_steps, n_starts, k)``."""
+    """Rows ``(n_steps, n_envs)`` of all rollouts, with zeros after their end, by start: ``(n_steps, n_starts, k)``."""
     padded = pad_sequence(parts)
     return padded.reshape(len(padded), -1, N_PER_START)
 

@@ -105,12 +105,16 @@ class Table(Generic[Row]):
 
         :return: One dictionary per row, with the columns of ``to_pandas``
         """
-        records: list[dict[str, Any]] = [{} for _ in self.rows]
-        for row, record in zip(self.rows, records, strict=True):
+        records = []
+        for row in self.rows:
+            record: dict[str, Any] = {}
             for column in self.columns:
-                record[column] = value = getattr(row, column)
+                value = getattr(row, column)
                 if isinstance(value, Estimate):
                     record |= {column: value.value, f"{column}_low": value.low, f"{column}_high": value.high}
+                else:
+                    record[column] = value
+            records.append(record)
         return records
 
 

@@ -1,8 +1,8 @@
 """
 Guards of the environments while a model learns: a fault is named where it enters, before it does harm.
 
-``step_wait`` and ``reset`` are replaced on two instances: the innermost ``DummyVecEnv``, but no subclass, to check the
-form of observations; and what lies right below each ``VecNormalize``, to check that numbers are finite.
+``step_wait`` and ``reset`` are replaced on two instances: the innermost ``DummyVecEnv``, not a subclass of it, to check
+the form of observations; and what lies right below each ``VecNormalize``, to check that numbers are finite.
 """
 
 from collections.abc import Callable, Iterator
@@ -87,8 +87,7 @@ def finite_step(step: Callable[[], VecEnvStepReturn]) -> VecEnvStepReturn:
     obs, rewards, dones, infos = step()
     check_finite("The reward", rewards, (None,))
     check_finite("The observation", obs, (None,))
-    # count_nonzero costs less than to ask each environment
-    if np.count_nonzero(dones):
+    if dones.any():
         for i in np.flatnonzero(dones).tolist():
             check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
     return obs, rewards, dones, infos

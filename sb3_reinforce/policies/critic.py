@@ -1,4 +1,4 @@
-"""The critic: its values along a rollout, and its regression on the returns with an optimizer apart."""
+"""The critic: its values along a rollout, and its regression on the returns with its own optimizer."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias

@@ -90,11 +90,9 @@ def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.M
     return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
 
 
-def distribution_of(
-    policy: ActorCriticPolicy, outputs: th.Tensor, action_dist: Distribution | None = None
-) -> Distribution:
-    """The distribution of actions for logits or means of shape ``(n, width)``, by default of the policy's kind."""
-    kind = action_dist or policy.action_dist
+def distribution_of(policy: ActorCriticPolicy, outputs: th.Tensor) -> Distribution:
+    """π(·|s) for logits or means of shape ``(n, width)``."""
+    kind = policy.action_dist
     if isinstance(kind, DiagGaussianDistribution):
         return kind.proba_distribution(outputs, policy.log_std)
     return kind.proba_distribution(outputs)
@@ -162,36 +160,30 @@ def split_parameters(
     They are read from the graph and not from their names. The third list (a shared features extractor) is part of the
     first.
     """
-    parameters = trainable(policy)
-    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
+    actor = actor_parameters(policy, obs, actions)
     route = route_of(policy, with_critic=True)
     values = evaluate(policy, route, obs, actions, with_values=True)[2]
-    in_critic = depends_on(cast(th.Tensor, values), parameters)
-    table = list(zip(parameters, in_actor, in_critic, strict=True))
-    return (
-        [parameter for parameter, actor, _ in table if actor],
-        [parameter for parameter, actor, critic in table if critic and not actor],
-        [parameter for parameter, actor, critic in table if critic and actor],
-    )
+    critic = reached_by(cast(th.Tensor, values), trainable(policy))
+    in_actor = set(actor)
+    return actor, [p for p in critic if p not in in_actor], [p for p in critic if p in in_actor]
 
 
-def trainable(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
+def trainable(policy: ActorCriticPolicy) -> Parameters:
     """The parameters that are trained, in the policy's order."""
     return [parameter for parameter in policy.parameters() if parameter.requires_grad]
 
 
-def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> list[th.nn.Parameter]:
+def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that log π depends on, in the policy's order."""
-    parameters = trainable(policy)
-    in_actor = depends_on(log_prob_and_entropy(policy, obs, actions)[0], parameters)
-    return [parameter for parameter, is_in_actor in zip(parameters, in_actor, strict=True) if is_in_actor]
+    return reached_by(log_prob_and_entropy(policy, obs, actions)[0], trainable(policy))
 
 
-def depends_on(output: th.Tensor, parameters: Parameters) -> list[bool]:
-    """Which parameters an output depends on."""
+def reached_by(output: th.Tensor, parameters: Parameters) -> Parameters:
+    """The parameters that an output depends on."""
     if not output.requires_grad:
-        return [False] * len(parameters)
-    return [grad is not None for grad in th.autograd.grad(output.sum(), parameters, allow_unused=True)]
+        return []
+    gradients = th.autograd.grad(output.sum(), parameters, allow_unused=True)
+    return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 
 
 def temperature_of(policy: ActorCriticPolicy) -> float:

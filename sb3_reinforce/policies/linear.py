@@ -20,7 +20,7 @@ class LinearPolicy(ActorCriticPolicy):
     :param lr_schedule: Learning rate schedule
     :param kwargs: As for ``ActorCriticPolicy``
     :raises ValueError: If ``net_arch`` asks for hidden layers, or observations are dicts that no features extractor
-        puts in a row
+        flattens
     """
 
     def __init__(

@@ -40,7 +40,6 @@ def natural_step(
     parameters: Parameters,
     gradients: Sequence[th.Tensor | None],
     target_kl: float,
-    damping: float = DAMPING,
 ) -> tuple[float, float]:
     """
     ``θ ← θ − α d`` with ``(F + c I) d = g`` and ``α² dᵀ F d / 2 = target_kl``; returns ‖g‖ and the mean divergence.
@@ -55,7 +54,7 @@ def natural_step(
         return norm, 0.0
     divergence = divergence_from_now(policy, obs)
     fisher_product = hessian_vector_product(divergence(), parameters)
-    d = conjugate_gradients(lambda v: fisher_product(v) + damping * v, g / norm)
+    d = conjugate_gradients(lambda v: fisher_product(v) + DAMPING * v, g / norm)
     curvature = float(d @ fisher_product(d))
     kl = None
     if 0 < curvature < math.inf:

@@ -102,7 +102,7 @@ def plain_actor(policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = Actor
     """
     The layers from the features to the logits or means of a policy whose actor is known to be plain, else None.
 
-    They are ``Linear`` layers with a bias and elementwise activations, and the features are the observations in a row.
+    They are ``Linear`` layers with a bias and elementwise activations, and the features are the flattened observations.
     A class that overrides methods of ``base`` is not known to be plain.
     """
     distribution = getattr(policy, "action_dist", None)
@@ -133,7 +133,7 @@ def plain_layers(
 
 
 def is_plain_extractor(extractor: Any) -> bool:
-    """Whether a features extractor only puts numbers in a row."""
+    """Whether a features extractor only flattens observations."""
     if type(extractor) not in (FlattenExtractor, CombinedExtractor):
         return False
     parts = (type(extractor), nn.ModuleDict, nn.Flatten)

@@ -176,7 +176,7 @@ class RecurrentPolicy(ActorCriticPolicy):
 
 
 def padded_index(sequence: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """The row at each place of padded sequences, shape ``(length, n_sequences)``, and which places are no padding."""
+    """The row at each place of padded sequences, shape ``(length, n_sequences)``, and which places are not padding."""
     order = sequence.argsort(stable=True)
     lengths = th.unique_consecutive(sequence[order], return_counts=True)[1]
     places = th.arange(int(lengths.max()), device=sequence.device)[:, None]

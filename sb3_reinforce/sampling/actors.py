@@ -13,6 +13,7 @@ from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
     DiagGaussianDistribution,
+    Distribution,
     MultiCategoricalDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -41,12 +42,16 @@ class PolicyActor:
         """Draw actions for observations of ``n_envs`` environments."""
         obs = obs_as_tensor(obs, self.policy.device)
         if not self.route.forward:
-            distribution = self.policy.get_distribution(obs)
+            distribution = self.distribution(obs)
             actions = distribution.get_actions()
             log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
             return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
         actions, values, log_prob = self.policy(obs)
         return actions.cpu().numpy().reshape(-1, *self.shape), values.cpu().numpy(), log_prob.cpu().numpy()
+
+    def distribution(self, obs: Any) -> Distribution:
+        """π(·|s) for observations of ``n_envs`` environments."""
+        return self.policy.get_distribution(obs)
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy would still act as this actor does."""

@@ -71,7 +71,7 @@ class MatrixActor:
         self.deterministic = deterministic
         self.device = policy.device
         self.takes_vectors = takes_vectors(policy, policy.pi_features_extractor)
-        self.as_env_actions = env_actions_of(policy, n_envs)
+        self.as_env_actions = env_actions_of(policy)
         self.temperatures = [hook.temperature for hook in temperature_hooks(layers[-1])]
 
         def stacked(parameter: th.Tensor) -> th.Tensor:
@@ -115,7 +115,7 @@ class MatrixActor:
         return x[:, 0]
 
     def features(self, obs: Any) -> th.Tensor:
-        """The observations in a row, shape ``(n_envs, n_features)``."""
+        """The flattened observations, shape ``(n_envs, n_features)``."""
         if self.takes_vectors:
             # The result of the lines below, for a tenth of their price
             return th.from_numpy(obs).to(self.device, th.float32).flatten(1)

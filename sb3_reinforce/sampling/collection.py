@@ -92,7 +92,7 @@ def collect(
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
     actor = actor_of(route, is_attached)
-    as_env_actions = env_actions_of(policy, env.num_envs)
+    as_env_actions = env_actions_of(policy)
     # A copy: some VecEnvs reuse the array of the dones
     starts = [np.array(model._last_episode_starts, dtype=bool)]
     terminal_obs: TerminalObs = {}
@@ -125,7 +125,7 @@ def collect(
         starts.append(dones.astype(bool))
         n_steps += 1
         rollout_buffer.pos = n_steps
-        if np.count_nonzero(dones):
+        if dones.any():
             counted = extent.count(starts[-1], n_steps)
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
             for i in counted:

@@ -59,7 +59,7 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
     # A process whose environments all start episodes has none
     state = [th.zeros_like(states[0]) if columns.state is None else columns.state for columns in all_columns if states]
     return Columns(
-        # An episode that ends behind the quota does not count, and the padding ends none
+        # An episode that ends beyond the quota does not count, and the padding ends none
         dones=side_by_side([columns.dones for columns in all_columns], n_steps),
         # In the order of one process: the last bit of a batch's values may depend on it
         terminal_obs=dict(sorted(terminal_obs, key=lambda item: item[0])),

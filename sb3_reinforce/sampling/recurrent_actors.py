@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_reinforce.estimation.returns import Bools
@@ -32,17 +32,13 @@ class RecurrentPolicyActor(PolicyActor):
         self.starts = starts
         self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
 
-    @th.no_grad()
-    def act(self, obs: Any) -> Acted:
-        """Draw actions for observations of ``n_envs`` environments."""
+    def distribution(self, obs: Any) -> Distribution:
+        """π(·|s) for observations of ``n_envs`` environments, after one more step of the state."""
         policy: Any = self.policy
         episode_starts = th.as_tensor(self.starts(), dtype=th.float32, device=policy.device)
-        distribution, self.halves = policy.get_distribution(
-            obs_as_tensor(obs, policy.device), self.halves, episode_starts
-        )
-        actions = distribution.get_actions()
-        log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
-        return actions.cpu().numpy().reshape(-1, *self.shape), None, log_prob
+        distribution: Distribution
+        distribution, self.halves = policy.get_distribution(obs, self.halves, episode_starts)
+        return distribution
 
     def state(self) -> th.Tensor:
         """The actor's state after its last step, shape ``(n_envs, 2, n_layers, n_hidden)``."""
@@ -96,7 +92,7 @@ class LstmCell:
         ``i, f, g, o = W_ih x + W_hh h + b``, then ``c ← σ(f) c + σ(i) tanh g`` and ``h ← σ(o) tanh c`` (Hochreiter and
         Schmidhuber, 1997, with the forget gate of Gers et al., 2000).
         """
-        if np.count_nonzero(starts):
+        if starts.any():
             self.hidden[starts] = 0
             self.cell[starts] = 0
         gates = self.from_obs(obs) + self.from_hidden(self.hidden)

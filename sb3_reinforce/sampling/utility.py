@@ -21,7 +21,7 @@ class Stopped(Exception):
 @dataclass
 class EpisodicUtility:
     """
-    U(θ) = E[Σ_t r_t] by the episodes of one update of a FiniteDifference, which begin with ``first_seed``.
+    U(θ) = E[Σ_t r_t] by the episodes of one update of a FiniteDifference, whose seeds begin with ``first_seed``.
 
     It keeps all candidates and their values; ``observed`` is None unless a VecNormalize is frozen meanwhile.
     """
@@ -69,7 +69,7 @@ class EpisodicUtility:
     def _on_step(self, step: CandidateStep) -> None:
         """Count a step of the environments and call the callback; raise ``Stopped`` if it returns False."""
         self.model.num_timesteps += len(step.dones)
-        if np.count_nonzero(step.finished):
+        if step.finished.any():
             finished = np.flatnonzero(step.finished)
             self.model._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
         self.callback.update_locals({"self": self.model, **vars(step)})

@@ -215,7 +215,7 @@ def healthy(env, timesteps, normalize=False, **kwargs):
     if normalize:
         env = VecNormalize(env, gamma=kwargs["gamma"])
     callback = PitfallCallback()
-    model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", gae_lambda=0.95, **kwargs).learn(timesteps, callback)
+    model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", **kwargs).learn(timesteps, callback)
     return callback.found, callback.n_updates - model.num_timesteps // (32 * 8)
 
 

@@ -24,6 +24,7 @@ from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.weights import training_batch
+from sb3_reinforce.policies import natural
 from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
 from sb3_reinforce.policies.natural import conjugate_gradients, line_search, natural_step
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -51,8 +52,10 @@ def gradient_in_range(policy, obs):
     return th.autograd.grad(-(weights * log_probs).sum(), policy.action_net.weight)
 
 
-@pytest.mark.parametrize(("damping", "given"), [(0.0, {"damping": 0.0}), (0.1, {})])
-def test_the_direction_is_the_gradient_times_the_inverse_fisher_information(damping, given):
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_the_direction_is_the_gradient_times_the_inverse_fisher_information(damping, monkeypatch):
+    assert natural.DAMPING == 0.1
+    monkeypatch.setattr(natural, "DAMPING", damping)
     policy = make_model().policy
     weight = policy.action_net.weight
     gradients = gradient_in_range(policy, OBS)
@@ -60,16 +63,17 @@ def test_the_direction_is_the_gradient_times_the_inverse_fisher_information(damp
     matrix = fisher(policy, OBS) + damping * th.eye(6, dtype=th.float64)
     expected = -th.linalg.pinv(matrix) @ gradients[0].flatten()
     before = to_vector([weight])
-    natural_step(policy, OBS, [weight], gradients, 0.01, **given)
+    natural_step(policy, OBS, [weight], gradients, 0.01)
     moved = to_vector([weight]) - before
     th.testing.assert_close(moved / moved.norm(), expected / expected.norm(), rtol=0, atol=1e-8)
 
 
-def test_the_step_does_not_depend_on_the_parametrization():
+def test_the_step_does_not_depend_on_the_parametrization(monkeypatch):
     """Features M x and weights W M⁻¹ are the same policy; so they are after the step, but not after a plain one."""
+    monkeypatch.setattr(natural, "DAMPING", 0.0)
     mix = th.tensor([[2.0, 0.3, 0.0], [-0.5, 0.4, 1.0], [0.1, 0.0, 5.0]])
     logits = {}
-    for natural in (True, False):
+    for is_natural in (True, False):
         for name, features in {"x": OBS, "M x": OBS @ mix.T}.items():
             policy = make_model().policy
             weight = policy.action_net.weight
@@ -77,12 +81,12 @@ def test_the_step_does_not_depend_on_the_parametrization():
                 with th.no_grad():
                     weight.copy_(weight @ th.linalg.inv(mix.double()))
             gradients = gradient_in_range(policy, features)
-            if natural:
-                natural_step(policy, features, [weight], gradients, 0.01, damping=0.0)
+            if is_natural:
+                natural_step(policy, features, [weight], gradients, 0.01)
             else:
                 with th.no_grad():
                     weight -= 0.1 * gradients[0]
-            logits[natural, name] = policy.get_distribution(features).distribution.logits.detach()
+            logits[is_natural, name] = policy.get_distribution(features).distribution.logits.detach()
     th.testing.assert_close(logits[True, "x"], logits[True, "M x"], rtol=0, atol=1e-6)
     assert (logits[False, "x"] - logits[False, "M x"]).abs().max() > 0.01
 
