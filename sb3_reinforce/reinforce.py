@@ -1,7 +1,6 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
 import copy
-import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar, cast
@@ -30,7 +29,6 @@ from sb3_reinforce.common.settings import (
     check_reinforce,
     check_starts,
 )
-from sb3_reinforce.common.tensors import take
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
@@ -464,11 +462,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         else:
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
                 grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
-            # Another pass over all images or sequences would take too long for a log. Earlier steps need no later ones
-            steps = slice(None if route.actor else math.ceil(len(log_prob) / 8))
-            kl = sampled_divergence(
-                self.policy, route, take(batch.observations, steps), batch.actions[steps], log_prob[steps]
-            )
+            if route.actor is None:
+                # Another pass over images or sequences would take longer than a log is worth
+                return grad_norm
+            kl = sampled_divergence(self.policy, route, batch.observations, batch.actions, log_prob)
         self.logger.record("train/kl", kl)
         return grad_norm
 

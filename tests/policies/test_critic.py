@@ -57,13 +57,13 @@ def test_cached_features_give_the_same_critic(policy, share):
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
 def test_how_often_a_shared_features_extractor_is_evaluated(mode):
-    """For each step, the policy's step and its divergence; with a critic for its passes and the last observations."""
+    """For each step and for the policy's; with a critic for its passes and the last observations."""
     model = make(ActorCriticCnnPolicy, n_critic_updates=5, **mode).learn(1)
     calls = []
     model.policy.features_extractor.register_forward_hook(lambda *args: calls.append(1))
     model.learn(1)
     n_steps = 10  # the length of every episode
-    assert len(calls) == n_steps + 2 + (1 + 2 if mode["baseline"] == "value" else 0)
+    assert len(calls) == n_steps + 1 + (1 + 2 if mode["baseline"] == "value" else 0)
 
 
 class ActionZero(ActorCriticCnnPolicy):
