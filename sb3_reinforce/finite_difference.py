@@ -227,7 +227,7 @@ class FiniteDifference(BasePolicyGradient):
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
-        check_learn(self, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

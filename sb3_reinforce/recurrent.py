@@ -55,7 +55,8 @@ class RecurrentREINFORCE(REINFORCE):
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: Of the policy, and of the critic unless ``critic_learning_rate`` is given; a schedule too
     :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
-    :param n_episodes: Whole episodes per rollout; 16 if ``n_steps`` is None too
+    :param n_episodes: Whole episodes per rollout; if ``n_steps`` is None too, 16, or one of each environment if there
+        are more
     :param batch_size: Steps per minibatch of the critic, at least one whole sequence
     :param kwargs: All other arguments of :class:`~sb3_reinforce.REINFORCE`
     :raises TypeError: If an argument is of the wrong type
@@ -68,6 +69,7 @@ class RecurrentREINFORCE(REINFORCE):
         "MultiInputLstmPolicy": MultiInputLstmPolicy,
         "MaskedLstmPolicy": MaskedLstmPolicy,
     }
+    prefers_episodes = True
 
     def __init__(
         self,
@@ -80,8 +82,6 @@ class RecurrentREINFORCE(REINFORCE):
         batch_size: int = 4096,
         **kwargs: Any,
     ):
-        if n_steps is None and n_episodes is None and kwargs.get("episodes_per_start", 1) == 1:
-            n_episodes = 16
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
         super().__init__(

@@ -139,6 +139,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         **A2C.policy_aliases,
         "MaskedPolicy": MaskedPolicy,
     }
+    #: Whether a rollout is by default whole episodes, also with a critic
+    prefers_episodes: ClassVar[bool] = False
     _arguments = REINFORCE_ARGUMENTS
     _own_argument = "reward_to_go"
     _instead = INSTEAD_OF_PPO
@@ -546,7 +548,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             have different arguments, or what ``collect_rollouts`` and ``train`` refuse
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
-        check_learn(self, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

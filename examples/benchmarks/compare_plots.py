@@ -1,5 +1,5 @@
 """
-What a comparison shows: tables, and pictures by rliable (intervals are 95 % of a stratified bootstrap).
+What a comparison shows: tables, learning curves, and a summary by rliable (intervals: 95 % of a stratified bootstrap).
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 

@@ -5,7 +5,7 @@ A plain pass is the loop that one would write: for each of 100 CartPole-v1 episo
 ``backward()``. Ratios, each of two runs next to each other, as CSV; on one thread, for an MlpPolicy before training and
 after, when its episodes last 500 steps.
 
-    python examples/benchmarks/comparison_cost.py > comparison_cost.csv
+    OMP_NUM_THREADS=1 python examples/benchmarks/comparison_cost.py > comparison_cost.csv
 """
 
 import argparse

@@ -155,8 +155,9 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     check_attributes(model, REINFORCE_ARGUMENTS)
     check_function("baseline", model.baseline, baselines)
     if model.n_steps is None and model.n_episodes is None:
-        model.n_steps = 32 if model.has_critic and not model.shares_starts else None
-        if model.n_steps is None:
+        if model.has_critic and not (model.shares_starts or model.prefers_episodes):
+            model.n_steps = 32
+        else:
             n_envs = model.n_envs * place()[1]
             model.n_episodes = n_envs if model.shares_starts else max(16, n_envs)
     if model.n_steps is not None and model.n_episodes is not None:
@@ -214,11 +215,9 @@ def check_finite_difference(model: Any, estimators: Functions, perturbations: Fu
         raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
 
 
-def check_learn(model: Any, *arguments: Any) -> None:
+def check_learn(env: Any, *arguments: Any) -> None:
     """Check the arguments of ``learn``, in their order."""
-    if model.env is None:
+    if env is None:
         raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
-    if model.is_collecting:
-        raise ValueError("learn cannot be called while the model collects a rollout: a callback can stop the training")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

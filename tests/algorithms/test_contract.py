@@ -32,8 +32,10 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.common import settings
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
 
@@ -410,18 +412,13 @@ def test_a_critic_without_parameters():
     assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
 
 
-@all_kinds
-def test_a_callback_cannot_train_the_model_that_collects_its_rollout(kind):
-    model = make(kind, "CartPole-v1")
-    with pytest.raises(ValueError, match="learn cannot be called while the model collects a rollout"):
-        model.learn(8, Record(lambda model: model.learn(8), at="step"))
-    assert model.learn(8).num_timesteps >= 8
-
-
-@pytest.mark.parametrize(("n_envs", "n_episodes"), [(1, 16), (20, 20)])
-def test_by_default_each_environment_has_an_episode(n_envs, n_episodes):
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", n_envs), baseline="none", device="cpu")
-    assert model.n_episodes == n_episodes
+@pytest.mark.parametrize(("n_envs", "n_processes", "n_episodes"), [(1, 1, 16), (20, 1, 20), (10, 2, 20)])
+def test_by_default_each_environment_has_an_episode(n_envs, n_processes, n_episodes, monkeypatch):
+    monkeypatch.setattr(settings, "place", lambda: (0, n_processes))
+    env = make_vec_env("CartPole-v1", n_envs)
+    assert REINFORCE("MlpPolicy", env, baseline="none", device="cpu").n_episodes == n_episodes
+    recurrent = RecurrentREINFORCE("MlpLstmPolicy", env, device="cpu")
+    assert (recurrent.n_steps, recurrent.n_episodes) == (None, n_episodes)
 
 
 def test_what_a_callback_sets_is_used():

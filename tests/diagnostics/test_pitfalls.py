@@ -209,14 +209,14 @@ def test_a_schedule_is_reported_by_its_present_value():
     assert "<function" not in "".join(found.values())
 
 
-def healthy(env, timesteps, normalize=False, **kwargs):
+def healthy(env, timesteps, n_envs=8, normalize=False, **kwargs):
     """The pitfalls found in a run, and how many of its updates were not examined."""
-    env = make_vec_env(env, 8, seed=0)
+    env = make_vec_env(env, n_envs, seed=0)
     if normalize:
         env = VecNormalize(env, gamma=kwargs["gamma"])
     callback = PitfallCallback()
     model = REINFORCE("MlpPolicy", env, seed=0, device="cpu", **kwargs).learn(timesteps, callback)
-    return callback.found, callback.n_updates - model.num_timesteps // (32 * 8)
+    return callback.found, callback.n_updates - model.num_timesteps // (32 * n_envs)
 
 
 @pytest.mark.parametrize(
@@ -225,6 +225,11 @@ def healthy(env, timesteps, normalize=False, **kwargs):
 def test_nothing_is_said_of_a_healthy_run(cartpole, pendulum):
     assert healthy("CartPole-v1", cartpole) == ({}, 0)
     assert healthy("Pendulum-v1", pendulum, normalize=True, gamma=0.9) == ({}, 0)
+
+
+def test_one_environment_leaves_mostly_noise():
+    with pytest.warns(UserWarning, match="The gradient is mostly noise"):
+        assert healthy("CartPole-v1", 10_000, n_envs=1)[0].keys() == {"too_few_episodes"}
 
 
 @pytest.mark.slow

@@ -18,8 +18,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
-IS_OLD = np.lib.NumpyVersion(np.__version__) < "1.25.0"
-OF_ONE = pytest.param(np.ones(1), marks=pytest.mark.skipif(IS_OLD, reason="NumPy took it for a number"))
 bare_or_normalized = pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 
 
@@ -203,6 +201,17 @@ def test_rewards_that_are_no_numbers(wrapper, value, kind):
     model = make(kind, wrapper(of_two(fault="reward", at=5, value=value)))
     with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
         model.learn(400)
+
+
+@all_kinds
+def test_a_reward_that_monitor_refuses(kind):
+    """Monitor's own error, after which training goes on."""
+    faulty = Faulty("reward", 5, "x")
+    model = make(kind, DummyVecEnv([lambda: Monitor(Faulty()), lambda: Monitor(faulty)]))
+    with pytest.raises(ValueError, match="could not convert string to float: 'x'"):
+        model.learn(400)
+    faulty.fault = ""
+    assert model.learn(400).num_timesteps >= 400
 
 
 @bare_or_normalized

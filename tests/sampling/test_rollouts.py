@@ -10,7 +10,9 @@ from callbacks import Record
 from environments import Corridor
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -39,6 +41,14 @@ def test_whole_episodes_begin_with_a_reset_where_the_user_has_stepped_the_enviro
     model.env.step(np.zeros(1, dtype=int))
     model.learn(1, reset_num_timesteps=False)
     assert model.rollout_buffer.observations[:, 0].argmax(-1).tolist() == [0, 1, 2] * 2
+
+
+def test_a_monitor_may_refuse_the_reset_that_whole_episodes_begin_with():
+    envs = [partial(Monitor, gym.make("CartPole-v1"), allow_early_resets=False) for _ in range(2)]
+    with pytest.raises(RuntimeError, match="Tried to reset an environment before done"):
+        REINFORCE("MlpPolicy", DummyVecEnv(envs), n_episodes=2, seed=0, device="cpu").learn(1000)
+    envs = [partial(Monitor, gym.make("CartPole-v1"), allow_early_resets=False) for _ in range(2)]
+    assert REINFORCE("MlpPolicy", DummyVecEnv(envs), n_steps=16, device="cpu").learn(32).num_timesteps == 32
 
 
 def test_lengths_of_used_episodes_are_drawn_without_bias():

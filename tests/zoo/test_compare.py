@@ -13,6 +13,7 @@ import pytest
 
 pandas = pytest.importorskip("pandas")
 
+import numpy as np
 import yaml
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
 
@@ -141,6 +142,15 @@ def test_a_task_that_is_not_registered_is_named_at_once(tmp_path, capsys):
         with pytest.raises(SystemExit):
             compare.main()
     assert "--tasks: Nope-v5 not registered" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
+def test_a_curve_is_the_interquartile_mean_between_the_evaluations(plots):
+    returns = {0: (0, -50), 1: (0, 8), 2: (0, 12), 3: (0, 90)}
+    rows = [(seed, steps, value) for seed, each in returns.items() for steps, value in zip((0, 100), each, strict=True)]
+    runs = pandas.DataFrame(rows, columns=["seed", "steps", "return"])
+    points, iqm, low, high = plots.curve(runs, "steps", 50)
+    np.testing.assert_allclose(iqm, points / 100 * 10)
+    assert (low <= iqm).all() and (iqm <= high).all() and low[-1] < 0 < high[-1]
 
 
 @pytest.mark.parametrize(
