@@ -82,8 +82,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
     :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
-        32 steps for ``baseline="value"``, 16 episodes for the others (with ``episodes_per_start``, one of each
-        environment)
+        32 steps for ``baseline="value"``, for the others 16 episodes, or one of each environment if there are more
+        (with ``episodes_per_start``, always one of each)
     :param gamma: Discount factor
     :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
         ``baseline="value"`` and ``reward_to_go=True``

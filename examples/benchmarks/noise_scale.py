@@ -49,7 +49,7 @@ class NoiseScaleEpisodes(GradientQualityCallback):
         self.scales.append(figures["noise_scale"])
         scale = np.clip(np.median(self.scales), self.least, self.most)
         # With unequal quotas some environments would wait for others
-        self.model.n_episodes = self.model.n_envs * round(scale / self.model.n_envs)
+        self.model.n_episodes = self.model.n_envs * max(1, round(scale / self.model.n_envs))
         return figures
 
 
