@@ -157,9 +157,14 @@ class RecurrentREINFORCE(REINFORCE):
         :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
         """
         self._actor = None
-        is_complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        self._next_state = self._state_after_rollout().cpu() if is_complete and n_rollout_steps is not None else None
-        return is_complete
+        try:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        finally:
+            # Also where a callback fails at the end of the rollout, after which the episodes go on
+            if self._last_obs is None or n_rollout_steps is None:
+                self._next_state = None
+            elif self._actor is not None:
+                self._next_state = self._state_after_rollout().cpu()
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
         policy = cast(RecurrentPolicy, self.policy)

@@ -48,7 +48,7 @@ from sb3_reinforce.policies.evaluation import (
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
-from sb3_reinforce.sampling.collection import Extent, check_rollout_data, collect, warn_of_own_methods
+from sb3_reinforce.sampling.collection import Extent, check_rollout_data, collect, keep_fractions, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
@@ -316,6 +316,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         check_starts(self)
         self.start_round()
         self._start_episodes(env, n_rollout_steps is None)
+        keep_fractions(rollout_buffer, self._last_obs, self.action_space)
         if n_rollout_steps is None:
             n_episodes = self.share_of(cast(int, self.n_episodes))
             extent = Extent.whole_episodes(n_episodes, env.num_envs, self.max_episode_steps)
@@ -512,6 +513,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if not model.has_critic:
             # λ weights values, and there are none
             model.gae_lambda = 1.0
+        model._schedules = dict(self._schedules)
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)

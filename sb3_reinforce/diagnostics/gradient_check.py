@@ -183,6 +183,7 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     # As long as θ if the gradient is shorter: a short step would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
+    collector.learning_rate = rate
     collector.lr_schedule = FloatSchedule(rate)
     # Without values no critic is trained
     collector.rollout = replace(rollout, values=None)

@@ -189,7 +189,8 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :return: The Axes
     """
     ax = new_axes(ax, (6.0, 6.6))
-    end = scape.scales[-1]
+    # Half a step beyond the outer points, which are the centres of pixels
+    end = scape.scales[-1] * (1 + 1 / (len(scape.scales) - 1))
     # Interpolated between the points, where contours of noisy utilities would be ragged
     square = (-end, end, -end, end)
     surface = ax.imshow(scape.utilities, cmap="Greys_r", origin="lower", extent=square, interpolation="bicubic")

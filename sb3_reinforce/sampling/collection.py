@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
@@ -146,6 +147,20 @@ def collect(
     if is_attached:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, route
+
+
+def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:
+    """Store fractions where a Box has an integer dtype: ``VecNormalize`` and a Gaussian policy return floats."""
+
+    def made_float(rows: np.ndarray) -> np.ndarray:
+        return rows if np.issubdtype(rows.dtype, np.floating) else rows.astype(np.float32)
+
+    def fitted(rows: np.ndarray, given: Any) -> np.ndarray:
+        return made_float(rows) if np.issubdtype(np.asarray(given).dtype, np.floating) else rows
+
+    buffer.observations = map_parts(fitted, buffer.observations, obs)
+    if isinstance(action_space, spaces.Box):
+        buffer.actions = made_float(buffer.actions)
 
 
 def write_step(

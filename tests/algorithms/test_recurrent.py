@@ -348,3 +348,20 @@ def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
 @pytest.mark.parametrize("algorithm", [REINFORCE, RecurrentREINFORCE, FiniteDifference])
 def test_the_log_has_the_name_of_the_algorithm(algorithm):
     assert signature(algorithm.learn).parameters["tb_log_name"].default == algorithm.__name__
+
+
+def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout():
+    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=5, learning_rate=0.0, seed=0, device="cpu")
+
+    def fail(model):
+        if model.num_timesteps == 30:
+            raise RuntimeError("at the end of the third rollout")
+
+    with pytest.raises(RuntimeError, match="third rollout"):
+        model.learn(100, Record(fail))
+    # The state after the fifteen steps is the one that a single rollout of fifteen ends with
+    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
+    whole = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=15, learning_rate=0.0, seed=0, device="cpu").learn(30)
+    th.testing.assert_close(model._next_state[:, 0], whole._next_state[:, 0])
+    assert model.learn(10, reset_num_timesteps=False).num_timesteps == 40

@@ -224,3 +224,12 @@ def test_the_parameters_stay_where_they_are_in_memory():
     addresses = [parameter.data_ptr() for parameter in model.policy.parameters()]
     check_gradient(model)
     assert [parameter.data_ptr() for parameter in model.policy.parameters()] == addresses
+
+
+def test_a_learning_rate_that_has_just_been_changed():
+    """The check passes, and training goes on with the new rate."""
+    model = REINFORCE("MlpPolicy", "CartPole-v1", learning_rate=1e-3, seed=0, device="cpu").learn(64)
+    model.learning_rate = 0.25
+    assert check_gradient(model).passed
+    model.learn(64)
+    assert model.policy.optimizer.param_groups[0]["lr"] == 0.25

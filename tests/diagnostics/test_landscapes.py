@@ -160,7 +160,7 @@ def test_every_picture_can_be_saved(tmp_path):
     found = landscape(bandit(), fans, n_points=3, n_episodes=2, progress_bar=True)
     assert [steps.shape for steps in found.steps.values()] == [(2,), (3, 2)]
     ax = plots.plot_landscape(found)
-    assert "3 × 3 points of 2 episodes" in ax.get_title() and ax.get_xlim() == (-1, 1)
+    assert "3 × 3 points of 2 episodes" in ax.get_title() and ax.get_xlim() == (-1.5, 1.5)
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["one (1)", "three (3)"]
     save(ax, tmp_path / "landscape.png")
     ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])

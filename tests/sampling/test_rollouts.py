@@ -12,7 +12,7 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -233,3 +233,39 @@ def test_a_box_action_is_stored_as_drawn_and_clipped_or_unscaled_for_the_environ
     stored = model.rollout_buffer.actions.ravel()
     assert squash_output or np.abs(stored).max() > 2
     np.testing.assert_allclose(np.ravel(sent), to_env(stored), atol=1e-6)
+
+
+class Integers(gym.Env):
+    observation_space = gym.spaces.Box(0, 100, (2,), np.uint8)
+    action_space = gym.spaces.Box(0, 3, (1,), np.int64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.integers(100, size=2, dtype=np.uint8), {}
+
+    def step(self, action):
+        return self.np_random.integers(100, size=2, dtype=np.uint8), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("dictionary", [False, True])
+def test_training_sees_the_fractions_that_the_policy_saw_and_drew(dictionary):
+    """VecNormalize returns floats for a Box of integers, and the Gaussian policy draws them."""
+
+    class Wrapped(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = gym.spaces.Dict({"a": env.observation_space})
+
+        def observation(self, obs):
+            return {"a": obs}
+
+    env = make_vec_env(lambda: Wrapped(Integers()) if dictionary else Integers(), 2, seed=0)
+    policy = "MultiInputPolicy" if dictionary else "MlpPolicy"
+    model = REINFORCE(policy, VecNormalize(env), learning_rate=0.0, n_steps=8, seed=0, device="cpu")
+    model.learn(16, lambda *_: True)
+    rollout = model.rollout
+    observations = rollout.observations["a"] if dictionary else rollout.observations
+    assert (observations % 1 > 0).any() and (rollout.actions % 1 > 0).any()
+    flat = observations.flatten(0, 1)
+    _, log_prob, _ = model.policy.evaluate_actions({"a": flat} if dictionary else flat, rollout.actions.flatten(0, 1))
+    np.testing.assert_allclose(log_prob.detach(), model.rollout_buffer.log_probs.flatten(), rtol=1e-5, atol=1e-5)
