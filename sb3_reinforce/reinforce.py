@@ -513,6 +513,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if not model.has_critic:
             # λ weights values, and there are none
             model.gae_lambda = 1.0
+        # A schedule that the copy renews is still to be renewed here
         model._schedules = dict(self._schedules)
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
@@ -546,8 +547,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
-        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, processes under torchrun
-            have different arguments, or what ``collect_rollouts`` and ``train`` refuse
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, or processes under
+            torchrun have different arguments; and as in ``collect_rollouts`` and ``train``
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

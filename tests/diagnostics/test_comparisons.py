@@ -113,6 +113,7 @@ def test_rows_are_the_variances_of_the_gradients_however_much_of_these_is_held(m
         weights = rollout.discounts * (rollout.returns - baseline(rollout))
         gradients = gradients_by_episode(rollout, weights)[0].double()
         assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
+        assert table[name].seconds > 0
     weighted, scores = gradients_by_episode(rollout, rollout.discounts * rollout.returns, rollout.discounts).double()
     floor = float(componentwise_residuals(weighted, scores).var(0).sum())
     assert table["floor"].variance.value == pytest.approx(floor, rel=1e-4)
