@@ -32,6 +32,7 @@ from sb3_reinforce.estimation.perturbations import (
     default_n_delta,
     new_generator,
 )
+from sb3_reinforce.estimation.weights import ROUNDING
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import trainable
 from sb3_reinforce.policies.linear import LinearPolicy
@@ -180,11 +181,6 @@ class FiniteDifference(BasePolicyGradient):
             self._generator = new_generator()
 
     @property
-    def shares_starts(self) -> bool:
-        """Whether several environments start alike."""
-        return self.common_random_numbers
-
-    @property
     def theta(self) -> th.Tensor:
         """θ, a copy of the actor's trainable parameters, shape ``(n,)``, float64."""
         return parameters.read(self._find_parameters())
@@ -312,7 +308,8 @@ class FiniteDifference(BasePolicyGradient):
         fit = fit_quality(estimate.candidates, utilities, gradient)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)
-        if self.standardize_utilities and utility_std > 0:
+        # Equal utilities, sums of rewards in another order, may differ by rounding
+        if self.standardize_utilities and utility_std > ROUNDING * float(utilities.abs().max()):
             gradient = gradient * estimate.delta_std / utility_std
         # The optimizer descends: here, and only here, the sign turns
         loss_gradient = [part[0] for part in parameters.split(-gradient[None], searched)]

@@ -157,6 +157,9 @@ class RecurrentREINFORCE(REINFORCE):
         :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
         """
         self._actor = None
+        if self._next_state is None and not np.all(self._last_episode_starts):
+            # Whole episodes, whose states are not kept, came before: a callback has set n_steps
+            self._last_obs = None
         try:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:

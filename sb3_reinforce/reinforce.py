@@ -30,7 +30,7 @@ from sb3_reinforce.common.settings import (
     check_starts,
 )
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import start_groups
+from sb3_reinforce.envs.starts import start_episodes, start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -344,8 +344,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             raise
         finally:
             self.is_collecting = False
-            if not is_collected:
-                # The environments stopped in the middle of episodes, and are reset before they are used again
+            if not is_collected or self.shares_starts:
+                # The environments stopped in the middle of episodes, or draw the same random numbers, and are reset
+                # before they are used again
                 self._last_obs = None
         # A process that has sent its part to process 0 has no rollout
         if columns is None or self.rollout is None:
@@ -365,7 +366,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self._last_obs = start_groups(env, self.episodes_per_start)
         # A measurement that failed in a callback leaves no observation
         elif self._last_obs is None or (are_whole and not np.all(self._last_episode_starts)):
-            self._last_obs = env.reset()  # type: ignore[assignment]
+            self._last_obs = start_episodes(env, None)
         else:
             return
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)

@@ -153,7 +153,9 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
 def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
-    check_function("baseline", model.baseline, baselines)
+    function = check_function("baseline", model.baseline, baselines)
+    # A function of this package has the limits of its name
+    model.baseline = next((name for name, each in baselines.items() if each is function), function)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
             model.n_steps = 32

@@ -12,7 +12,7 @@ from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
-from sb3_reinforce.envs.starts import separate
+from sb3_reinforce.envs.starts import reseed
 from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.estimators import ESTIMATORS
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
@@ -151,7 +151,7 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     collector.discount_scores = False
     collector.max_episode_steps = model.max_episode_steps
     with undisturbed(model):
-        separate(env_of(model))
+        reseed(env_of(model))
         rollout = collect_episodes(collector)
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()

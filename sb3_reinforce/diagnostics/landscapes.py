@@ -62,8 +62,6 @@ class CandidateUtility:
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)
             returns = evaluate_candidates(self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
-            # Environments that have shared a start would go on with the same random numbers
-            self.env.seed(self.seed)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
     def _count(self, step: CandidateStep) -> None:

@@ -13,7 +13,7 @@ from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
-from sb3_reinforce.envs.starts import check_groups, separate
+from sb3_reinforce.envs.starts import check_groups
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
 from sb3_reinforce.estimation.weights import ROUNDING
@@ -100,7 +100,6 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
         for part in seeds.reshape(-1, env.num_envs):
             firsts.append(start_from(collector, part))
             rollouts.append(collect_episodes(collector, bar))
-        separate(env)
         check_groups(stack([take(obs, i) for obs in firsts for i in range(env.num_envs)]), N_PER_START)
     return rollouts
 

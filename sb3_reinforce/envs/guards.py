@@ -38,8 +38,7 @@ def guarded(learn: Learn) -> Learn:
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
             finally:
-                if model.shares_starts and model.env is not None:
-                    separate(model.env)
+                if model.env is not None and separate(model.env):
                     # The next reset, which takes the new seeds, is then one of the next learn()
                     model._last_obs = None
 

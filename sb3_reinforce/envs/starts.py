@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import torch as th
@@ -10,21 +11,27 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.envs.checks import check_finite
 
+# VecEnvs whose environments may draw the same random numbers
+alike: WeakSet[VecEnv] = WeakSet()
+
 
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
-    """The first observations of episodes, environment i with the seed ``seeds[i]``."""
+    """The first observations of episodes, environment i with the seed ``seeds[i]``; None for different ones."""
+    if seeds is None:
+        separate(env)
+        return env.reset()
+    alike.add(env.unwrapped)
     # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
     # all that follows, which goes through every wrapper, continues its random numbers
-    if seeds is not None:
-        for seed in np.unique(seeds).tolist():
-            try:
-                env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
-            except NotImplementedError as error:
-                raise ValueError(
-                    "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
-                    f"{type(env.unwrapped).__name__} does not have here: use another VecEnv, or train with "
-                    "common_random_numbers=False or episodes_per_start=1"
-                ) from error
+    for seed in np.unique(seeds).tolist():
+        try:
+            env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
+        except NotImplementedError as error:
+            raise ValueError(
+                "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
+                f"{type(env.unwrapped).__name__} does not have here: use another VecEnv, or train with "
+                "common_random_numbers=False or episodes_per_start=1"
+            ) from error
     return env.reset()
 
 
@@ -39,8 +46,17 @@ def start_groups(env: VecEnv, size: int) -> Any:
     return obs
 
 
-def separate(env: VecEnv) -> None:
-    """Give environments that have shared a start different random numbers again, from their next reset on."""
+def separate(env: VecEnv) -> bool:
+    """Give environments that may draw the same random numbers different ones; False if they have them already."""
+    may_be_alike = env.unwrapped in alike
+    if may_be_alike:
+        reseed(env)
+    return may_be_alike
+
+
+def reseed(env: VecEnv) -> None:
+    """Give environments new random numbers from PyTorch's generator, different ones, from their next reset on."""
+    alike.discard(env.unwrapped)
     # A user's VecEnv may have no seeds
     with suppress(NotImplementedError):
         env.seed(int(th.randint(2**31, ())))

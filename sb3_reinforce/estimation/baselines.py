@@ -116,14 +116,18 @@ def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
 
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
+    # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖²: in float32 equal returns c would have a baseline that differs from c
+    level = rollout.returns[rollout.used].mean()
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     numbers = th.unique(rollout.episodes[rollout.used])
     n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
     for group in numbers.split(max(1, CHUNK // (2 * n_parameters))):
         part = replace(rollout, used=rollout.used & th.isin(rollout.episodes, group))
-        weighted, scores = gradients_by_episode(part, rollout.discounts * rollout.returns, rollout.discounts)
+        weights = rollout.discounts * (rollout.returns - level)
+        weighted, scores = gradients_by_episode(part, weights, rollout.discounts)
         products[group] = th.stack([(weighted * scores).sum(1), scores.square().sum(1)], dim=1).cpu().double()
-    return products[:, 0], products[:, 1]
+    centred, squares = products.T
+    return centred + level * squares, squares
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:

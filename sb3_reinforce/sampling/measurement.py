@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
-from sb3_reinforce.envs.starts import separate, start_episodes
+from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -26,13 +26,11 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     env = cast(VecEnv, model.env)
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
-    if getattr(model, "shares_starts", False):
-        separate(env)
     with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
         yield
-        obs = env.reset()
+        obs = start_episodes(env, None)
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-    model._last_obs = obs  # type: ignore[assignment]
+    model._last_obs = obs
 
 
 def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:

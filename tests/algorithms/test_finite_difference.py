@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -84,6 +85,18 @@ def test_the_step_is_the_gradient_scaled_and_clipped(standardize, bound):
     assert logged["rollout/utility_std"] == pytest.approx(float(estimate.utilities.std(correction=0)))
     expected = step if bound is None else step * bound / norm
     th.testing.assert_close(model.theta - theta, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_utilities_that_differ_by_rounding_make_no_step():
+    callback = Record(lambda model: None)
+    model = make(Line(), learning_rate=0.0, policy_kwargs={"optimizer_class": th.optim.SGD}).learn(1, callback)
+    estimate = model.estimate_gradient(callback)
+    theta = model.theta
+    model.learning_rate = 1.0
+    equal = 0.7 + 1e-16 * th.arange(6.0).double()
+    model.train(replace(estimate, utilities=equal, gradient=1e-15 * estimate.gradient))
+    assert equal.std() > 0
+    th.testing.assert_close(model.theta, theta)
 
 
 def test_n_top_uses_the_best_pair():

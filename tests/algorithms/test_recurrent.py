@@ -350,6 +350,21 @@ def test_the_log_has_the_name_of_the_algorithm(algorithm):
     assert signature(algorithm.learn).parameters["tb_log_name"].default == algorithm.__name__
 
 
+def test_episodes_that_lost_their_memory_are_not_gone_on_with():
+    """A rollout of whole episodes keeps no states, and its last episodes are cut."""
+
+    def change(model):
+        model.n_steps = 5
+        model.n_episodes = None
+
+    env = make_vec_env(lambda: Corridor((3, 7)), 2, seed=0)
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=3, seed=0, device="cpu")
+    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].all())
+    model.learn(60, callback=[Record(change), starts])
+    assert starts.records[:2] == [True, True]
+    assert not all(starts.records)
+
+
 def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout():
     env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
     model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=5, learning_rate=0.0, seed=0, device="cpu")

@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference, GymnasiumVecEnv
-from sb3_reinforce.diagnostics import compare_starts, sample
+from sb3_reinforce.diagnostics import compare_starts, landscape, sample
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -123,6 +123,8 @@ def test_what_cannot_share_its_start_is_refused():
         REINFORCE("MlpPolicy", Scales(), baseline="leave_one_out", episodes_per_start=2)
     with pytest.raises(ValueError, match="compares the episodes of a start"):
         REINFORCE("MlpPolicy", env, episodes_per_start=4)
+    with pytest.raises(ValueError, match="compares the episodes of a start"):
+        REINFORCE("MlpPolicy", env, baseline=BASELINES["none"], episodes_per_start=4)
 
 
 def test_what_a_callback_changes_is_checked():
@@ -144,6 +146,45 @@ def test_pending_seeds_are_used_up():
     model.learn(1, callback=starts, reset_num_timesteps=False)
     (rows,) = starts.records
     assert (rows[0] == rows[1]).all() and (rows[1] != rows[2]).any()
+
+
+@pytest.mark.parametrize("n_steps", [None, 200])
+def test_a_callback_may_turn_groups_off(n_steps):
+    """What they shared ends there, also where all episodes ended at once."""
+
+    def change(model):
+        if model._n_updates == 0:
+            model.episodes_per_start = 1
+            model.n_steps = n_steps
+            model.n_episodes = None if n_steps else 8
+
+    env = make_vec_env("Pendulum-v1", 8, seed=0)
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0)
+    starts = first_observations()
+    model.learn(3 * 1600, callback=[Record(change), starts])
+    assert [len(np.unique(rows, axis=0)) for rows in starts.records[:3]] == [2, 8, 8]
+
+
+def test_a_callback_may_turn_common_random_numbers_off():
+    """The perturbations are too small to act differently, so that equal starts have equal steps."""
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    model = FiniteDifference("LinearPolicy", env, estimator="forward", n_delta=3, delta_std=1e-12, seed=0)
+
+    def change(model):
+        model.common_random_numbers = False
+
+    states = Record(lambda model: np.unique(env.get_attr("state"), axis=0), at="step")
+    model.learn(2 * 1600, callback=[Record(change), states])
+    assert len(states.records[0]) == 1
+    assert len(states.records[-2]) == 4
+
+
+def test_after_a_landscape_the_environments_are_independent_again():
+    """Its points have common starts."""
+    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    model = REINFORCE("MlpPolicy", env, seed=0)
+    landscape(model, n_points=3, n_episodes=2)
+    assert len(np.unique(model._last_obs, axis=0)) == 4
 
 
 @pytest.mark.parametrize("measure", [sample, compare_starts])
@@ -182,6 +223,7 @@ def test_a_vec_env_need_not_be_seeded(name):
     model = MODELS_THAT_SHARE_STARTS[name](make_vec_env("Pendulum-v1", 4))
     model.set_env(env)
     assert model.learn(1).num_timesteps >= 4 * 200
+    assert landscape(model, n_points=2, n_episodes=1).utilities.shape == (2, 2)
 
 
 def test_memory_takes_one_episode_of_each_environment():

@@ -21,6 +21,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARGUMENTS, REINFORCE_ARGUMENTS
+from sb3_reinforce.estimation import BASELINES
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
@@ -107,6 +108,7 @@ RECURRENT, MASKABLE = (
         ("episodes", {"baseline": "optimal", "n_episodes": 1}, ["n_episodes", "at least 2", "'optimal'", "compares"]),
         ("episodes", {"baseline": "leave_one_out", "n_episodes": 1}, ["at least 2", "'leave_one_out'"]),
         ("episodes", {"baseline": "time_mean", "n_episodes": 1}, ["at least 2", "'time_mean'"]),
+        ("episodes", {"baseline": BASELINES["time_mean"], "n_episodes": 1}, ["at least 2", "'time_mean'"]),
         ("steps", {"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
         ("steps", {"env": "Pendulum-v1", "temperature": 0.5}, ["temperature", "Box"]),
         ("steps", {"env": "Pendulum-v1", "temperature": lambda progress: 1.0}, ["temperature", "Box"]),
