@@ -308,9 +308,10 @@ class FiniteDifference(BasePolicyGradient):
         fit = fit_quality(estimate.candidates, utilities, gradient)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)
-        # Equal utilities, sums of rewards in another order, may differ by rounding
-        if self.standardize_utilities and utility_std > ROUNDING * float(utilities.abs().max()):
-            gradient = gradient * estimate.delta_std / utility_std
+        if self.standardize_utilities:
+            # Equal utilities, sums of rewards in another order, may differ by rounding
+            are_equal = utility_std <= ROUNDING * float(utilities.abs().max())
+            gradient = gradient * (0.0 if are_equal else estimate.delta_std / utility_std)
         # The optimizer descends: here, and only here, the sign turns
         loss_gradient = [part[0] for part in parameters.split(-gradient[None], searched)]
         with optimization.kept_finite(self.policy.optimizer, searched, "policy"):

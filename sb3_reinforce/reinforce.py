@@ -30,7 +30,7 @@ from sb3_reinforce.common.settings import (
     check_starts,
 )
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import start_episodes, start_groups
+from sb3_reinforce.envs.starts import may_be_alike, start_episodes, start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -229,7 +229,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._running = Running.none(1)
         if _init_setup_model:
             self._setup_model()
-            check_starts(self)
+            check_starts(self, BASELINES)
 
     @property
     def has_critic(self) -> bool:
@@ -313,7 +313,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
-        check_starts(self)
+        check_starts(self, BASELINES)
         self.start_round()
         self._start_episodes(env, n_rollout_steps is None)
         keep_fractions(rollout_buffer, self._last_obs, self.action_space)
@@ -344,7 +344,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             raise
         finally:
             self.is_collecting = False
-            if not is_collected or self.shares_starts:
+            if not is_collected or may_be_alike(env):
                 # The environments stopped in the middle of episodes, or draw the same random numbers, and are reset
                 # before they are used again
                 self._last_obs = None

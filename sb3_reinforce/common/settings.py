@@ -153,9 +153,7 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
 def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
-    function = check_function("baseline", model.baseline, baselines)
-    # A function of this package has the limits of its name
-    model.baseline = next((name for name, each in baselines.items() if each is function), function)
+    name_baseline(model, baselines)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
             model.n_steps = 32
@@ -183,8 +181,15 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
 
 
-def check_starts(model: Any) -> None:
+def name_baseline(model: Any, baselines: Functions) -> None:
+    """Replace a function of this package by its name, which has limits; a user's has none."""
+    function = check_function("baseline", model.baseline, baselines)
+    model.baseline = next((name for name, each in baselines.items() if each is function), function)
+
+
+def check_starts(model: Any, baselines: Functions) -> None:
     """Check that the episodes of a rollout can share their starts, as the model and its environments are now."""
+    name_baseline(model, baselines)
     m = model.episodes_per_start
     n_episodes = model.n_envs * place()[1]
     if m == 1:

@@ -18,7 +18,7 @@ from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.common.processes import place
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
-from sb3_reinforce.envs.starts import separate
+from sb3_reinforce.envs.starts import may_be_alike, separate
 from sb3_reinforce.envs.workers import watch
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
@@ -38,7 +38,8 @@ def guarded(learn: Learn) -> Learn:
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
             finally:
-                if model.env is not None and separate(model.env):
+                if model.env is not None and may_be_alike(model.env):
+                    separate(model.env)
                     # The next reset, which takes the new seeds, is then one of the next learn()
                     model._last_obs = None
 

@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from typing import Any
-from weakref import WeakSet
 
 import numpy as np
 import torch as th
@@ -11,8 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.envs.checks import check_finite
 
-# VecEnvs whose environments may draw the same random numbers
-alike: WeakSet[VecEnv] = WeakSet()
+# The attribute that marks a VecEnv whose environments may draw the same random numbers
+MARK = "environments_may_be_alike"
 
 
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
@@ -20,7 +19,7 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     if seeds is None:
         separate(env)
         return env.reset()
-    alike.add(env.unwrapped)
+    setattr(env.unwrapped, MARK, True)
     # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
     # all that follows, which goes through every wrapper, continues its random numbers
     for seed in np.unique(seeds).tolist():
@@ -46,20 +45,23 @@ def start_groups(env: VecEnv, size: int) -> Any:
     return obs
 
 
-def separate(env: VecEnv) -> bool:
-    """Give environments that may draw the same random numbers different ones; False if they have them already."""
-    may_be_alike = env.unwrapped in alike
-    if may_be_alike:
+def may_be_alike(env: VecEnv) -> bool:
+    """Whether environments may draw the same random numbers, since they have started from given seeds."""
+    return getattr(env.unwrapped, MARK, False)
+
+
+def separate(env: VecEnv) -> None:
+    """Give environments that may draw the same random numbers different ones, from their next reset on."""
+    if may_be_alike(env):
         reseed(env)
-    return may_be_alike
 
 
 def reseed(env: VecEnv) -> None:
-    """Give environments new random numbers from PyTorch's generator, different ones, from their next reset on."""
-    alike.discard(env.unwrapped)
+    """Give environments new random numbers by PyTorch's generator, different ones, from their next reset on."""
     # A user's VecEnv may have no seeds
     with suppress(NotImplementedError):
         env.seed(int(th.randint(2**31, ())))
+    setattr(env.unwrapped, MARK, False)
 
 
 def are_alike(obs: Any, size: int) -> bool:

@@ -117,7 +117,7 @@ def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
     # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖²: in float32 equal returns c would have a baseline that differs from c
-    level = rollout.returns[rollout.used].mean()
+    level = group_means(rollout)
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     numbers = th.unique(rollout.episodes[rollout.used])
     n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
@@ -127,7 +127,19 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
         weighted, scores = gradients_by_episode(part, weights, rollout.discounts)
         products[group] = th.stack([(weighted * scores).sum(1), scores.square().sum(1)], dim=1).cpu().double()
     centred, squares = products.T
-    return centred + level * squares, squares
+    levels = th.zeros_like(squares)
+    levels[rollout.episodes] = level
+    return centred + levels * squares, squares
+
+
+def group_means(rollout: Rollout) -> th.Tensor:
+    """The mean of G over the used steps of its group, at each step."""
+    groups = rollout.groups.flatten()
+    used = rollout.used.to(rollout.returns)
+    zeros = used.new_zeros(int(groups.max()) + 1)
+    totals = zeros.index_add(0, groups, (rollout.returns * used).flatten())
+    counts = zeros.index_add(0, groups, used.flatten())
+    return (totals / counts.clamp(min=1))[rollout.groups]
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
-from sb3_reinforce.envs.starts import start_episodes
+from sb3_reinforce.envs.starts import separate, start_episodes
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -27,10 +27,13 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
     with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
-        yield
-        obs = start_episodes(env, None)
+        try:
+            yield
+        finally:
+            separate(env)
+        obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-    model._last_obs = obs
+    model._last_obs = obs  # type: ignore[assignment]
 
 
 def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:

@@ -350,7 +350,7 @@ def test_the_log_has_the_name_of_the_algorithm(algorithm):
     assert signature(algorithm.learn).parameters["tb_log_name"].default == algorithm.__name__
 
 
-def test_episodes_that_lost_their_memory_are_not_gone_on_with():
+def test_episodes_without_their_memory_are_reset():
     """A rollout of whole episodes keeps no states, and its last episodes are cut."""
 
     def change(model):

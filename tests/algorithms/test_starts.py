@@ -148,12 +148,13 @@ def test_pending_seeds_are_used_up():
     assert (rows[0] == rows[1]).all() and (rows[1] != rows[2]).any()
 
 
+@pytest.mark.parametrize("at", ["step", "rollout_end"])
 @pytest.mark.parametrize("n_steps", [None, 200])
-def test_a_callback_may_turn_groups_off(n_steps):
-    """What they shared ends there, also where all episodes ended at once."""
+def test_a_callback_may_turn_groups_off(n_steps, at):
+    """The environments are independent from the next rollout on, also where all episodes ended at once."""
 
     def change(model):
-        if model._n_updates == 0:
+        if model.episodes_per_start > 1:
             model.episodes_per_start = 1
             model.n_steps = n_steps
             model.n_episodes = None if n_steps else 8
@@ -161,7 +162,7 @@ def test_a_callback_may_turn_groups_off(n_steps):
     env = make_vec_env("Pendulum-v1", 8, seed=0)
     model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0)
     starts = first_observations()
-    model.learn(3 * 1600, callback=[Record(change), starts])
+    model.learn(3 * 1600, callback=[Record(change, at), starts])
     assert [len(np.unique(rows, axis=0)) for rows in starts.records[:3]] == [2, 8, 8]
 
 
@@ -185,6 +186,10 @@ def test_after_a_landscape_the_environments_are_independent_again():
     model = REINFORCE("MlpPolicy", env, seed=0)
     landscape(model, n_points=3, n_episodes=2)
     assert len(np.unique(model._last_obs, axis=0)) == 4
+    model.max_episode_steps = 10
+    with pytest.raises(ValueError, match="max_episode_steps"):
+        landscape(model, n_points=3, n_episodes=2)
+    assert len(np.unique(env.reset(), axis=0)) == 4
 
 
 @pytest.mark.parametrize("measure", [sample, compare_starts])

@@ -1,5 +1,7 @@
 """Each baseline on grids drawn by hand, and the cases in which there is nothing to average."""
 
+from dataclasses import replace
+
 import pytest
 import torch as th
 
@@ -61,12 +63,22 @@ def test_a_timestep_that_one_episode_reaches_has_a_defined_weight():
 
 @pytest.mark.parametrize("baseline", ["mean", "time_mean", "leave_one_out", "optimal"])
 def test_a_batch_without_variance_has_no_gradient(baseline):
-    """The baseline differs from equal returns by the rounding of float64, which the weights are rid of."""
+    """Some baselines differ from equal returns by the rounding of float64, which compute_advantages removes."""
     model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu")
-    same = make_rollout([[7.3] * 5], [[1] * 5], [[0] * 5], policy=model.policy)
+    same = make_rollout([[0.7] * 7], [[1] * 7], [[0] * 7], policy=model.policy)
     same.actions[0, ::2] = 1
     th.testing.assert_close(BASELINES[baseline](same), same.returns, rtol=1e-14, atol=0)
     assert not compute_advantages(same, BASELINES[baseline](same)).any()
+
+
+@pytest.mark.parametrize("other", [1.0, 1e9])
+def test_optimal_keeps_its_digits_beside_a_group_of_other_returns(other):
+    model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu")
+    returns = [[0.7, 0.7, 0.7, other, other, other]]
+    groups = replace(make_rollout(returns, [[1] * 6], [[0] * 6], policy=model.policy), episodes_per_start=3)
+    groups.actions[0, ::2] = 1
+    assert len(groups.groups.unique()) == 2
+    assert not compute_advantages(groups, BASELINES["optimal"](groups)).any()
 
 
 def test_optimal_is_zero_where_no_other_episode_has_a_score():

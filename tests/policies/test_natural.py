@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.distributions import kl_divergence
@@ -250,11 +251,18 @@ def test_a_policy_with_another_distribution_is_refused():
     assert th.equal(to_vector(model.policy.parameters()), before)
 
 
-@pytest.mark.parametrize("baseline", ["leave_one_out", "optimal"])
+EQUAL_RETURNS = {
+    "leave_one_out": (0.99, lambda t, action: 0.1 + 0.1 * t),
+    "optimal": (1.0, lambda t, action: 0.7 * (t == 6)),
+}
+
+
+@pytest.mark.parametrize("baseline", EQUAL_RETURNS)
 def test_equal_returns_are_no_gradient(baseline):
-    """Their mean may differ from them by rounding."""
-    env = DummyVecEnv([lambda: Corridor((7,), lambda t, action: 0.7 * (t == 6))] * 3)
-    model = REINFORCE("MlpPolicy", env, step="natural", baseline=baseline, gamma=1.0, n_episodes=9, seed=0)
+    """The baseline may differ from them by rounding; the optimal one is the same at all steps of an episode."""
+    gamma, reward = EQUAL_RETURNS[baseline]
+    env = DummyVecEnv([lambda: Corridor((7,), reward)] * 3)
+    model = REINFORCE("MlpPolicy", env, step="natural", baseline=baseline, gamma=gamma, n_episodes=9, seed=0)
     assert divergences_of(model, 63) == [0.0]
 
 
