@@ -37,11 +37,13 @@ from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
 from sb3_reinforce.policies.evaluation import (
     Parameters,
     Route,
+    acting_log_prob,
     evaluate,
     floor_std,
     route_of,
     sampled_divergence,
     set_temperature,
+    some_steps,
     split_parameters,
     trainable,
 )
@@ -464,12 +466,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             grad_norm, kl = natural_step(self.policy, batch.observations, actor, gradients, target_kl)
             self.policy.set_training_mode(True)
         else:
+            obs, actions = batch.observations, batch.actions
+            if route.actor is None:
+                # Passes over images or sequences take long, and in training mode they may not be repeatable
+                obs, actions = some_steps(self.policy, obs, actions)
+                log_prob = acting_log_prob(self.policy, route, obs, actions)
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
                 grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
-            if route.actor is None:
-                # Another pass over images or sequences would take longer than a log is worth
-                return grad_norm
-            kl = sampled_divergence(self.policy, route, batch.observations, batch.actions, log_prob)
+            kl = sampled_divergence(self.policy, route, obs, actions, log_prob)
         self.logger.record("train/kl", kl)
         return grad_norm
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_reinforce.common.tensors import take
 from sb3_reinforce.policies.plain_mlp import (
     DivideLogits,
     evaluate_layers,
@@ -28,6 +29,8 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 Parameters: TypeAlias = list[nn.Parameter]
 
+# Steps that an estimate is made from, at least
+MIN_STEPS = 64
 # At this temperature the logits of float32 networks put all probability on one action
 MIN_TEMPERATURE = 1e-3
 
@@ -135,20 +138,40 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
 
 
 @th.no_grad()
-def sampled_divergence(
-    policy: ActorCriticPolicy, route: Route, obs: PyTorchObs, actions: th.Tensor, log_prob: th.Tensor
-) -> float:
+def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
 
     Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative. NaN if π's outputs are.
     """
     try:
-        log_ratio = evaluate(policy, route, obs, actions, with_values=False)[0] - log_prob
+        log_ratio = acting_log_prob(policy, route, obs, actions) - old
     except ValueError:
         # PyTorch makes no distribution of outputs that are not finite; the next rollout reports them
         return math.nan
     return float((th.expm1(log_ratio) - log_ratio).mean())
+
+
+def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
+    """An eighth of the steps, for an estimate; all of a recurrent policy, whose sequences must be whole."""
+    if isinstance(policy, RecurrentPolicy):
+        return obs, actions
+    # The same places in each rollout of this length: the policy's random numbers are left alone
+    order = th.randperm(len(actions), generator=th.Generator().manual_seed(0))
+    steps = order[: max(MIN_STEPS, len(actions) // 8)].to(actions.device)
+    return take(obs, steps), actions[steps]
+
+
+@th.no_grad()
+def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
+    """log π(a|s) of the policy that acts: dropout and batch normalization are in evaluation mode."""
+    is_training = policy.training and route.actor is None
+    if is_training:
+        policy.set_training_mode(False)
+    log_prob = evaluate(policy, route, obs, actions, with_values=False)[0]
+    if is_training:
+        policy.set_training_mode(True)
+    return log_prob
 
 
 def split_parameters(

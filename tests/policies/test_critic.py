@@ -57,13 +57,13 @@ def test_cached_features_give_the_same_critic(policy, share):
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
 def test_how_often_a_shared_features_extractor_is_evaluated(mode):
-    """For each step and for the policy's; with a critic for its passes and the last observations."""
+    """For each step, the policy's and its divergence (2); with a critic for its passes and the last observations."""
     model = make(ActorCriticCnnPolicy, n_critic_updates=5, **mode).learn(1)
     calls = []
     model.policy.features_extractor.register_forward_hook(lambda *args: calls.append(1))
     model.learn(1)
     n_steps = 10  # the length of every episode
-    assert len(calls) == n_steps + 1 + (1 + 2 if mode["baseline"] == "value" else 0)
+    assert len(calls) == n_steps + 3 + (1 + 2 if mode["baseline"] == "value" else 0)
 
 
 class ActionZero(ActorCriticCnnPolicy):
@@ -141,8 +141,8 @@ def test_only_an_extractor_that_does_not_move_is_kept(share):
     extractor = model.policy.vf_features_extractor
     extractor.register_forward_hook(lambda module, *args: modes.append(module.training))
     model.learn(1)
-    # The last rows: three passes of the critic, or one for all of them
-    assert modes[-3:] == [True] * 3 if not share else modes[-2:] == [True, False]
+    # Three passes of the critic; or the policy's, two for its divergence and one for the critic
+    assert modes[-3:] == [True] * 3 if not share else modes[-4:] == [True, False, False, False]
 
 
 @both_policies

@@ -26,7 +26,13 @@ from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies import natural
-from sb3_reinforce.policies.evaluation import action_distribution, route_of, sampled_divergence
+from sb3_reinforce.policies.evaluation import (
+    action_distribution,
+    log_prob_and_entropy,
+    route_of,
+    sampled_divergence,
+    some_steps,
+)
 from sb3_reinforce.policies.natural import conjugate_gradients, line_search, natural_step
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
@@ -303,13 +309,53 @@ def test_a_target_may_fall_to_0_also_in_a_saved_model(tmp_path, recwarn):
     assert not recwarn
 
 
-def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one():
-    old = Record(lambda model: deepcopy(model.policy))
-    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=64, learning_rate=0.05, seed=0, device="cpu").learn(64, old)
+class Unsteady(FlattenExtractor):
+    """Its features differ in training mode, in which each pass changes them."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return th.nn.functional.dropout(self.norm(super().forward(observations)), 0.5, self.training)
+
+
+LOGGED = {
+    "MLP": ("MlpPolicy", "CartPole-v1", {}),
+    "gSDE": ("MlpPolicy", "Pendulum-v1", {"use_sde": True}),
+    "images": ("CnnPolicy", FakeImageEnv(screen_height=40, screen_width=40, n_channels=1), {}),
+    "dropout": ("MlpPolicy", "CartPole-v1", {"policy_kwargs": {"features_extractor_class": Unsteady}}),
+    "memory": ("MlpLstmPolicy", "CartPole-v1", {}),
+}
+
+
+@pytest.mark.parametrize("name", LOGGED)
+def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one(name):
+    policy, env, kwargs = LOGGED[name]
+    algorithm = RecurrentREINFORCE if name == "memory" else REINFORCE
+    old = Record(lambda model: deepcopy(model.policy.state_dict()))
+    model = algorithm(policy, env, n_steps=64, learning_rate=0.01, seed=0, device="cpu", **kwargs).learn(64, old)
+    model.policy.set_training_mode(False)
     batch = training_batch(model.rollout, model.rollout_buffer, normalize=False)
-    before, after = (
-        policy.evaluate_actions(batch.observations, batch.actions)[1].double().detach()
-        for policy in (old.records[0], model.policy)
-    )
-    expected = float(((after - before).exp() - 1 - (after - before)).mean())
-    assert 1e-4 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-3)
+    log_probs = []
+    for state in (model.policy.state_dict(), old.records[0]):
+        model.policy.load_state_dict(state)
+        log_probs.append(log_prob_and_entropy(model.policy, batch.observations, batch.actions)[0].double().detach())
+    log_ratio = log_probs[0] - log_probs[1]
+    expected = float((log_ratio.exp() - 1 - log_ratio).mean())
+    assert 1e-6 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-2)
+
+
+def test_a_log_changes_no_statistics():
+    """The passes in training mode are the policy's; the critic's evaluate a shared extractor as it is."""
+    kwargs = {"features_extractor_class": Unsteady}
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs=kwargs, seed=0).learn(128)
+    assert model.policy.features_extractor.norm.num_batches_tracked == 2
+
+
+@pytest.mark.parametrize(("n", "expected"), [(50, 50), (100, 64), (4096, 512)])
+def test_an_estimate_takes_different_steps(n, expected):
+    policy = make_model().policy
+    obs, actions = some_steps(policy, {"numbers": th.arange(n)}, th.arange(n))
+    assert len(actions.unique()) == len(actions) == expected
+    assert th.equal(obs["numbers"], actions)
