@@ -258,6 +258,8 @@ class FiniteDifference(BasePolicyGradient):
         :raises Stopped: If the callback returns False
         :raises ValueError: As ``learn``
         """
+        # The user or a callback may have changed arguments
+        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         callback.on_rollout_start()
         self.start_round()
         self.is_collecting = True

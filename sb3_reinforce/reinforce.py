@@ -231,7 +231,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._running = Running.none(1)
         if _init_setup_model:
             self._setup_model()
-            check_starts(self, BASELINES)
+            check_starts(self)
 
     @property
     def has_critic(self) -> bool:
@@ -307,6 +307,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             that needs one, or if an episode does not end. The parameters have not changed, and the environments are
             reset before they are used again
         """
+        # The user or a callback may have changed arguments
+        check_reinforce(self, BASELINES)
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
         # The last rollout may have the columns of several processes
@@ -315,7 +317,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
-        check_starts(self, BASELINES)
+        check_starts(self)
+        if n_rollout_steps is None and self.n_episodes is None:
+            n_rollout_steps = self.n_steps
         self.start_round()
         self._start_episodes(env, n_rollout_steps is None)
         keep_fractions(rollout_buffer, self._last_obs, self.action_space)

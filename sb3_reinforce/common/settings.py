@@ -141,7 +141,11 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
     """Check the arguments as the model has them now, and store each in Python's own type."""
     for name, check in arguments.items():
         attribute = ATTRIBUTES.get(name, name)
-        value = check(name, getattr(model, attribute))
+        given = getattr(model, attribute)
+        if name in model._schedules and model._schedules[name].given is given:
+            # It was checked when it was made, and a function of the user may be slow
+            continue
+        value = check(name, given)
         if not isinstance(value, CheckedSchedule):
             setattr(model, attribute, value)
     check_subclass("policy", model.policy_class, ActorCriticPolicy)
@@ -153,7 +157,9 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
 def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
-    name_baseline(model, baselines)
+    function = check_function("baseline", model.baseline, baselines)
+    # A function of this package has the limits of its name
+    model.baseline = next((name for name, each in baselines.items() if each is function), function)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
             model.n_steps = 32
@@ -181,15 +187,8 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
 
 
-def name_baseline(model: Any, baselines: Functions) -> None:
-    """Replace a function of this package by its name, which has limits; a user's has none."""
-    function = check_function("baseline", model.baseline, baselines)
-    model.baseline = next((name for name, each in baselines.items() if each is function), function)
-
-
-def check_starts(model: Any, baselines: Functions) -> None:
+def check_starts(model: Any) -> None:
     """Check that the episodes of a rollout can share their starts, as the model and its environments are now."""
-    name_baseline(model, baselines)
     m = model.episodes_per_start
     n_episodes = model.n_envs * place()[1]
     if m == 1:

@@ -1,6 +1,7 @@
 """Each argument is checked at construction, by load, by set_env and by learn; the error names it."""
 
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
 from inspect import signature
 
@@ -8,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At
+from callbacks import At, Record
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import KINDS, both, make
+from models import KINDS, both, make, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -69,6 +70,40 @@ def test_a_wrong_argument_is_named_with_its_value(algorithm, name):
         with pytest.raises((TypeError, ValueError), match=name) as error:
             algorithm(**{"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu", name: value})
         assert callable(value) or str(value) in str(error.value)
+
+
+USED_AT_CONSTRUCTION = {
+    "policy", "policy_kwargs", "tensorboard_log", "stats_window_size", "verbose", "seed", "device", "use_sde",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (kind, name)
+        for kind, table in {"steps": REINFORCE_ARGUMENTS, "search": FINITE_DIFFERENCE_ARGUMENTS}.items()
+        for name in sorted(table.keys() - USED_AT_CONSTRUCTION)
+    ],
+)
+def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name):
+    model = make(kind)
+    before = deepcopy(model.get_parameters())
+    for value in wrong_values(TABLES[type(model)][name]):
+        setattr(model, name, value)
+        with pytest.raises((TypeError, ValueError), match=name):
+            model.learn(64)
+    assert plain(model.get_parameters()) == plain(before)
+
+
+@pytest.mark.parametrize(("first", "second"), [((64, None), (None, 4)), ((None, 4), (64, None))])
+def test_a_callback_may_change_the_kind_of_rollout_at_its_start(first, second):
+    def change(model):
+        model.n_steps, model.n_episodes = second
+
+    model = make("steps", n_steps=first[0], n_episodes=first[1], seed=0)
+    used = Record(lambda model: "rollout/used_fraction" in model.logger.name_to_value)
+    model.learn(300, callback=[Record(change, "rollout_start"), used], log_interval=1)
+    assert used.records[-1] == (second[0] is None)
 
 
 @both
