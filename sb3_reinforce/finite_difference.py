@@ -167,12 +167,16 @@ class FiniteDifference(BasePolicyGradient):
         self.policy = policy.to(self.device)
         if policy_class in (ActorCriticPolicy, LinearPolicy):
             self._maybe_recommend_cpu(policy_class.__name__)
+        self._check_arguments()
+        if self._generator is None:
+            self._generator = new_generator()
+
+    def _check_arguments(self) -> None:
+        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
             self.n_delta = default_n_delta(self.estimator, n_parameters)
-        if self._generator is None:
-            self._generator = new_generator()
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""
@@ -227,6 +231,7 @@ class FiniteDifference(BasePolicyGradient):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._check_arguments()
         n = self.n_parameters
         if self.estimator == "regression" and cast(int, self.n_delta) <= n:
             warnings.warn(
@@ -258,9 +263,9 @@ class FiniteDifference(BasePolicyGradient):
         :raises Stopped: If the callback returns False
         :raises ValueError: As ``learn``
         """
-        # The user or a callback may have changed arguments
-        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         callback.on_rollout_start()
+        # The user or a callback may have changed arguments
+        self._check_arguments()
         self.start_round()
         self.is_collecting = True
         try:

@@ -30,7 +30,7 @@ from sb3_reinforce.common.settings import (
     check_starts,
 )
 from sb3_reinforce.envs.guards import guarded
-from sb3_reinforce.envs.starts import may_be_alike, start_episodes, start_groups
+from sb3_reinforce.envs.starts import has_given_seeds, start_episodes, start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
@@ -303,12 +303,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             to, or without a critic G_t; both are 0 at steps that are not used
         :param n_rollout_steps: Steps per environment, None for whole episodes
         :return: False if the callback stopped the collection; the rollout is then dropped
-        :raises ValueError: If a reward, an observation or a baseline is not finite, if no episode ended in a rollout
-            that needs one, or if an episode does not end. The parameters have not changed, and the environments are
-            reset before they are used again
+        :raises TypeError: If an argument of the model has been changed to a wrong type
+        :raises ValueError: If one has been changed to a wrong value, if a reward, an observation or a baseline is not
+            finite, if no episode ended in a rollout that needs one, or if an episode does not end. The parameters have
+            not changed, and the environments are reset where they stopped in the middle of episodes
         """
-        # The user or a callback may have changed arguments
-        check_reinforce(self, BASELINES)
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
         # The last rollout may have the columns of several processes
@@ -316,9 +315,12 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.reset()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
+        n_steps = self.n_steps
         callback.on_rollout_start()
+        # The user or a callback may have changed arguments
+        check_reinforce(self, BASELINES)
         check_starts(self)
-        if n_rollout_steps is None and self.n_episodes is None:
+        if self.n_steps != n_steps:
             n_rollout_steps = self.n_steps
         self.start_round()
         self._start_episodes(env, n_rollout_steps is None)
@@ -350,9 +352,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             raise
         finally:
             self.is_collecting = False
-            if not is_collected or may_be_alike(env):
-                # The environments stopped in the middle of episodes, or draw the same random numbers, and are reset
-                # before they are used again
+            if not is_collected or has_given_seeds(env):
+                # The environments stopped in the middle of episodes, or may draw the same random numbers: they are
+                # reset before they are used again
                 self._last_obs = None
         # A process that has sent its part to process 0 has no rollout
         if columns is None or self.rollout is None:
@@ -472,7 +474,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         else:
             obs, actions = batch.observations, batch.actions
             if route.actor is None:
-                # Passes over images or sequences take long, and in training mode they may not be repeatable
+                # Passes over images or sequences take long, and those in training mode cannot be repeated
                 obs, actions = some_steps(self.policy, obs, actions)
                 log_prob = acting_log_prob(self.policy, route, obs, actions)
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):

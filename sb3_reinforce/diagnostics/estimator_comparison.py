@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch as th
 
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number, check_unless_none
@@ -151,8 +152,10 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     collector.discount_scores = False
     collector.max_episode_steps = model.max_episode_steps
     with undisturbed(model):
-        reseed(env_of(model))
+        reseed(env_of(model), int(th.randint(2**31, ())))
         rollout = collect_episodes(collector)
+        # Training would go on from the same starts after each comparison
+        reseed(env_of(model), np.random.randint(2**31))
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
     wanted = {id(parameter) for parameter in searched_parameters(rollout.policy)}

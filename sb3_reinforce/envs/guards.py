@@ -18,7 +18,7 @@ from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.common.processes import place
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
-from sb3_reinforce.envs.starts import may_be_alike, separate
+from sb3_reinforce.envs.starts import has_given_seeds, separate
 from sb3_reinforce.envs.workers import watch
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
@@ -30,6 +30,7 @@ def guarded(learn: Learn) -> Learn:
     @wraps(learn)
     def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:
         with interruptible(), guard(model.env):
+            forget_seeds(model)
             try:
                 return learn(model, *args, **kwargs)
             except BadData as error:
@@ -38,12 +39,16 @@ def guarded(learn: Learn) -> Learn:
                     f"{error} (step {step} since learn() began). The policy has not been updated with it."
                 ) from error
             finally:
-                if model.env is not None and may_be_alike(model.env):
-                    separate(model.env)
-                    # The next reset, which takes the new seeds, is then one of the next learn()
-                    model._last_obs = None
+                forget_seeds(model)
 
     return cast(Learn, run)
+
+
+def forget_seeds(model: Any) -> None:
+    """Let a model whose environments have given seeds start new episodes, with different random numbers."""
+    if model.env is not None and has_given_seeds(model.env):
+        separate(model.env)
+        model._last_obs = None
 
 
 @contextmanager

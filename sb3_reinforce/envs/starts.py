@@ -10,12 +10,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.envs.checks import check_finite
 
-# The attribute that marks a VecEnv whose environments may draw the same random numbers
-MARK = "environments_may_be_alike"
+# The attribute that marks a VecEnv with given seeds: its environments may repeat each other, or earlier episodes
+MARK = "has_given_seeds"
 
 
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
-    """The first observations of episodes, environment i with the seed ``seeds[i]``; None for different ones."""
+    """The first observations of episodes, environment i with the seed ``seeds[i]``; None for none given."""
     if seeds is None:
         separate(env)
         return env.reset()
@@ -45,23 +45,24 @@ def start_groups(env: VecEnv, size: int) -> Any:
     return obs
 
 
-def may_be_alike(env: VecEnv) -> bool:
-    """Whether environments may draw the same random numbers, since they have started from given seeds."""
+def has_given_seeds(env: VecEnv) -> bool:
+    """Whether environments have started from given seeds, and may draw the same random numbers."""
     return getattr(env.unwrapped, MARK, False)
 
 
 def separate(env: VecEnv) -> None:
-    """Give environments that may draw the same random numbers different ones, from their next reset on."""
-    if may_be_alike(env):
-        reseed(env)
+    """Give environments with given seeds new and different ones, from their next reset on."""
+    if has_given_seeds(env):
+        # Measurements seed PyTorch's generator, with which training would go on from the same starts after each
+        reseed(env, np.random.randint(2**31))
+        setattr(env.unwrapped, MARK, False)
 
 
-def reseed(env: VecEnv) -> None:
-    """Give environments new random numbers by PyTorch's generator, different ones, from their next reset on."""
+def reseed(env: VecEnv, seed: int) -> None:
+    """Give environments different seeds, from their next reset on."""
     # A user's VecEnv may have no seeds
     with suppress(NotImplementedError):
-        env.seed(int(th.randint(2**31, ())))
-    setattr(env.unwrapped, MARK, False)
+        env.seed(seed)
 
 
 def are_alike(obs: Any, size: int) -> bool:

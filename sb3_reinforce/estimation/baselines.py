@@ -134,12 +134,8 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
 
 def group_means(rollout: Rollout) -> th.Tensor:
     """The mean of G over the used steps of its group, at each step."""
-    groups = rollout.groups.flatten()
-    used = rollout.used.to(rollout.returns)
-    zeros = used.new_zeros(int(groups.max()) + 1)
-    totals = zeros.index_add(0, groups, (rollout.returns * used).flatten())
-    counts = zeros.index_add(0, groups, used.flatten())
-    return (totals / counts.clamp(min=1))[rollout.groups]
+    totals, counts = _sums_at(rollout.groups, rollout)
+    return totals / counts.clamp(min=1)
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:
@@ -153,7 +149,11 @@ def sum_of_others(x: th.Tensor) -> th.Tensor:
 def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """The sum of G_t over the group's used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
     place = rollout.timesteps + rollout.groups * (rollout.timesteps.max() + 1)
-    _, place = th.unique(place, return_inverse=True)
+    return _sums_at(th.unique(place, return_inverse=True)[1], rollout)
+
+
+def _sums_at(place: th.Tensor, rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+    """The sum of G_t over the used steps of the same place, and their number; each ``(n_steps, n_envs)``."""
     used = rollout.used.to(rollout.returns)
     zeros = used.new_zeros(int(place.max()) + 1)
     totals = zeros.index_add(0, place.flatten(), (rollout.returns * used).flatten())

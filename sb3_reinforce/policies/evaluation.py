@@ -29,7 +29,7 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 Parameters: TypeAlias = list[nn.Parameter]
 
-# Steps that an estimate is made from, at least
+# The fewest steps for an estimate
 MIN_STEPS = 64
 # At this temperature the logits of float32 networks put all probability on one action
 MIN_TEMPERATURE = 1e-3
@@ -137,7 +137,6 @@ def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[:2]
 
 
-@th.no_grad()
 def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
@@ -153,7 +152,7 @@ def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, action
 
 
 def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
-    """An eighth of the steps, for an estimate; all of a recurrent policy, whose sequences must be whole."""
+    """An eighth of the steps, at least 64, for an estimate; all of a recurrent policy, whose sequences stay whole."""
     if isinstance(policy, RecurrentPolicy):
         return obs, actions
     # The same places in each rollout of this length: the policy's random numbers are left alone
@@ -162,16 +161,18 @@ def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple
     return take(obs, steps), actions[steps]
 
 
-@th.no_grad()
 def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
     """log π(a|s) of the policy that acts: dropout and batch normalization are in evaluation mode."""
     is_training = policy.training and route.actor is None
     if is_training:
         policy.set_training_mode(False)
-    log_prob = evaluate(policy, route, obs, actions, with_values=False)[0]
-    if is_training:
-        policy.set_training_mode(True)
-    return log_prob
+    try:
+        # A user's evaluate_actions may differentiate
+        with th.set_grad_enabled(route.evaluate_actions):
+            return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
+    finally:
+        if is_training:
+            policy.set_training_mode(True)
 
 
 def split_parameters(

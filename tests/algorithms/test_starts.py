@@ -1,6 +1,7 @@
 """Groups of episodes that share their start."""
 
 import runpy
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference, GymnasiumVecEnv
-from sb3_reinforce.diagnostics import compare_starts, landscape, sample
+from sb3_reinforce.diagnostics import compare_estimators, compare_starts, landscape, sample
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -178,6 +179,22 @@ def test_a_callback_may_turn_common_random_numbers_off():
     model.learn(2 * 1600, callback=[Record(change), states])
     assert len(states.records[0]) == 1
     assert len(states.records[-2]) == 4
+
+
+MEASUREMENTS = {
+    "landscape": partial(landscape, n_points=2, n_episodes=1),
+    "starts": partial(compare_starts, n_starts=8),
+    "estimators": partial(compare_estimators, n_episodes=4, n_estimates=3, estimators=("likelihood_ratio",)),
+}
+
+
+@pytest.mark.parametrize("name", MEASUREMENTS)
+def test_training_does_not_repeat_its_starts_after_measurements(name):
+    """Which seed PyTorch's generator."""
+    model = REINFORCE("MlpPolicy", make_vec_env("Pendulum-v1", 4, seed=0), n_steps=200, seed=0)
+    starts = first_observations()
+    model.learn(3 * 800, callback=[starts, Record(MEASUREMENTS[name])])
+    assert len({rows.tobytes() for rows in starts.records}) == 3
 
 
 def test_after_a_landscape_the_environments_are_independent_again():

@@ -72,8 +72,9 @@ def test_a_wrong_argument_is_named_with_its_value(algorithm, name):
         assert callable(value) or str(value) in str(error.value)
 
 
-USED_AT_CONSTRUCTION = {
+USED_BEFORE = {
     "policy", "policy_kwargs", "tensorboard_log", "stats_window_size", "verbose", "seed", "device", "use_sde",
+    "min_std",
 }  # fmt: skip
 
 
@@ -82,16 +83,21 @@ USED_AT_CONSTRUCTION = {
     [
         (kind, name)
         for kind, table in {"steps": REINFORCE_ARGUMENTS, "search": FINITE_DIFFERENCE_ARGUMENTS}.items()
-        for name in sorted(table.keys() - USED_AT_CONSTRUCTION)
+        for name in sorted(table.keys() - USED_BEFORE)
     ],
 )
-def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name):
+@pytest.mark.parametrize("at", ["before", "rollout_start"])
+def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name, at):
     model = make(kind)
     before = deepcopy(model.get_parameters())
     for value in wrong_values(TABLES[type(model)][name]):
-        setattr(model, name, value)
+        given = getattr(model, name)
+        change = Record(lambda model, value=value: setattr(model, name, value), "rollout_start")
+        if at == "before":
+            setattr(model, name, value)
         with pytest.raises((TypeError, ValueError), match=name):
-            model.learn(64)
+            model.learn(64, callback=change)
+        setattr(model, name, given)
     assert plain(model.get_parameters()) == plain(before)
 
 
