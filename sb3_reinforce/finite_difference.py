@@ -172,6 +172,7 @@ class FiniteDifference(BasePolicyGradient):
             self._generator = new_generator()
 
     def _check_arguments(self) -> None:
+        """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
         check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters

@@ -15,7 +15,7 @@ MARK = "has_given_seeds"
 
 
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
-    """The first observations of episodes, environment i with the seed ``seeds[i]``; None for none given."""
+    """The first observations of episodes, environment i with the seed ``seeds[i]``; None leaves the seeds open."""
     if seeds is None:
         separate(env)
         return env.reset()
