@@ -346,6 +346,21 @@ def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one(name):
     assert 1e-6 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-2)
 
 
+class Differentiating(ActorCriticPolicy):
+    """Its log π needs a gradient, which is nothing under no_grad."""
+
+    def evaluate_actions(self, obs, actions):
+        obs = obs.requires_grad_()
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        (slope,) = th.autograd.grad(log_prob.sum(), obs, create_graph=True)
+        return values, log_prob - 1e-3 * slope.square().sum(1), entropy
+
+
+def test_a_policy_that_differentiates_has_a_divergence_too():
+    model = REINFORCE(Differentiating, "CartPole-v1", n_steps=64, seed=0, device="cpu").learn(64)
+    assert model.logger.name_to_value["train/kl"] > 0
+
+
 def test_a_log_changes_no_statistics():
     """The passes in training mode are the policy's; the critic's evaluate a shared extractor as it is."""
     kwargs = {"features_extractor_class": Unsteady}
