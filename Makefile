@@ -1,4 +1,4 @@
-.PHONY: format lint type test check docs examples agents wheel test-lowest
+.PHONY: format lint type test check tables docs examples agents wheel test-lowest
 
 format:
 	ruff check --select I --fix .
@@ -15,6 +15,10 @@ test:
 	python -m pytest
 
 check: lint type test
+
+# Writes the tables of results into README.md and docs/, from the rows
+tables:
+	python docs/_ext/fill_tables.py
 
 # Executes the lesson's pages whose code has changed; SPHINXOPTS="-D nb_execution_mode=off" executes none
 docs:

@@ -8,8 +8,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 
 import lesson  # noqa: E402
-import tables  # noqa: E402
-import tuning  # noqa: E402
+from sphinx.application import Sphinx  # noqa: E402
 
 import sb3_reinforce  # noqa: E402
 
@@ -25,11 +24,9 @@ html_theme_options = {"navigation_with_keys": True}
 html_show_copyright = False
 copybutton_exclude = ".linenos, .gp, .go"
 
-myst_enable_extensions = ["colon_fence", "dollarmath", "substitution"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 html_math_renderer = "mathml"
 myst_heading_anchors = 3
-# The tables of results, computed from the committed CSVs
-myst_substitutions = tables.all_tables() | {"tuning": tuning.table()}
 
 # The lesson's pages are examples/*.py. A page is executed again only when its code has changed
 lesson.copy_pages(HERE.parent / "examples", HERE / "lesson")
@@ -51,3 +48,8 @@ python_use_unqualified_type_names = True
 
 doctest_test_doctest_blocks = "default"
 linkcheck_anchors_ignore_for_url = [r"https://github\.com/.*"]
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", lesson.link_pages)

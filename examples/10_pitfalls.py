@@ -1,5 +1,5 @@
 # %% [markdown]
-# # What can go wrong, and who says so?
+# # What can go wrong, and how do you notice?
 #
 # `PitfallCallback` watches a training, changes nothing, and warns once about each of eight known pitfalls. In a
 # healthy run it is silent. Here are eight runs that each fall into one.

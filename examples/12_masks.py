@@ -1,5 +1,5 @@
 # %% [markdown]
-# # What is it worth to forbid actions?
+# # What is an action mask worth?
 #
 # Each of 40 doors is opened by the key with its number. At each door 29 or 30 keys are known not to fit: a mask forbids
 # them. A policy without the mask could learn to avoid wrong keys, too. How much does the mask save?

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # How far should a difference reach?
+# # How large should a difference be?
 #
 # The oldest way to measure a slope: move a little, and see what changes. Nothing has to be known of the policy or of
 # the simulator. Along a perturbation $\delta$ of the parameters,

@@ -46,7 +46,7 @@ class RecurrentREINFORCE(REINFORCE):
     ``policy_kwargs`` as in sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
     ``shared_lstm``, ``lstm_kwargs``; ``memory`` is ``"lstm"``, ``"gru"`` or ``"rnn"``.
 
-    To predict, hand the state on; without it each call starts an episode:
+    To predict, pass the returned state to the next call; without it each call starts an episode:
 
         >>> state, episode_start = None, np.ones(1, dtype=bool)  # doctest: +SKIP
         >>> action, state = model.predict(obs, state, episode_start)  # doctest: +SKIP

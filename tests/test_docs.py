@@ -46,7 +46,7 @@ ELSEWHERE = {
     r"^make agents$": "minutes; tests/zoo/test_zoo.py runs its two commands",
     r"torch\.distributed\.run": "tests/common/test_processes.py and tests/zoo/test_zoo_processes.py start the launcher",
     r"processes\.py": "minutes: it starts eight processes for each row",
-    r"^make (format|test-lowest)$|-m slow$": "it changes files, or takes many minutes: by hand, or at night",
+    r"^make (format|tables|test-lowest)$|-m slow$": "it changes files, or takes many minutes: by hand, or at night",
     r"^hf |^tensorboard |^python train\.py$|python -m sb3_reinforce\.zoo$": "a program of others, or no command",
 }
 IS_COMMAND = re.compile(r"(\S*python[\d.]*|\S*pip|make|hf|tensorboard|\.) \S|\.ci/run$")
@@ -135,9 +135,10 @@ def test_commands_have_these_options(name: str, command: str) -> None:
 def test_files_extras_and_make_targets_exist(name: str) -> None:
     text = TEXTS[name]
     paths = re.findall(r"[`\s(]((?:tests|examples|docs|sb3_reinforce|\.ci|\.github)/[\w./-]*\w)", text)
-    paths += [path for path in re.findall(r"\]\(([^)#:]+)\)", text) if name == "README.md"]
     missing = [path for path in paths if not (ROOT / path).exists() and not path.startswith("docs/_build")]
     assert not missing
+    folder = next(path.parent for path in PAGES if path.name == name)
+    assert all((folder / path).exists() for path in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text))
     project = (ROOT / "pyproject.toml").read_text()
     for extras in re.findall(r'pip install -e "\.\[([\w,]+)\]"', text):
         assert all(re.search(rf"^{extra} = \[", project, re.MULTILINE) for extra in extras.split(","))
@@ -151,11 +152,15 @@ def test_named_tests_exist() -> None:
             assert f"def {test}(" in (ROOT / path).read_text(), f"{path}::{test}"
 
 
-def test_the_readme_is_short_and_its_results_are_those_of_the_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", [name for name, text in TEXTS.items() if "<!-- end -->" in text])
+def test_tables_are_those_of_the_rows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise run `make tables`."""
     pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
-    import tables
+    from fill_tables import filled
 
-    assert tables.readme() in TEXTS["README.md"]
-    assert f"REINFORCE makes {tables.images()} of A2C's steps a second" in TEXTS["README.md"]
+    assert filled(TEXTS[name]) == TEXTS[name]
+
+
+def test_the_readme_is_short() -> None:
     assert len(TEXTS["README.md"].splitlines()) <= 130

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jupytext
 from nbformat import NotebookNode
+from sphinx.application import Sphinx
 
 
 def copy_pages(source: Path, target: Path) -> None:
@@ -23,6 +24,13 @@ def copy_pages(source: Path, target: Path) -> None:
     for path in target.glob("*.py"):
         if path.name not in pages:
             path.unlink()
+
+
+def link_pages(app: Sphinx, page: str, content: list[str]) -> None:
+    """In the site, links to the scripts lead to their pages."""
+    content[0] = re.sub(
+        r"\]\(\.\./examples/(\d+)_(\w+\.py)\)", lambda found: f"](lesson/{int(found[1]):02}_{found[2]})", content[0]
+    )
 
 
 def links(page: str, script: str) -> str:

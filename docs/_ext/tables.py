@@ -3,8 +3,12 @@
 import pandas as pd
 from cells import LABELS, NONE, by_task, counted, markdown, number, read, short, spread
 
-# The task of the README's table for each kind of action, observation and length of episode
-README_TASKS = ("CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1", "Acrobot-v1", "LunarLander-v3")
+# The README's tasks, each with the steps for which the Zoo tunes its PPO
+README_TASKS = {
+    "CartPole-v1": 100_000, "MountainCarContinuous-v0": 20_000, "Pendulum-v1": 100_000, "Acrobot-v1": 1_000_000,
+    "LunarLander-v3": 1_000_000, "HalfCheetah-v5": 1_000_000, "Walker2d-v5": 1_000_000,
+}  # fmt: skip
+PEERS = ("a2c", "ppo", "trpo")
 
 
 def published(task: str, *algorithms: str) -> str:
@@ -26,15 +30,18 @@ def final(*names: str) -> pd.DataFrame:
     return rows[rows["evaluation"] == "final"]
 
 
+def beside_peers(task: str, budget: int, runs: pd.DataFrame) -> list[str]:
+    """The final returns of REINFORCE and its peers, with the task and the number of steps."""
+    returns = [runs.loc[runs["algorithm"] == name, "return"] for name in ("reinforce", *PEERS)]
+    return [f"{task} ({short(budget)})", *map(counted, returns)]
+
+
 def comparison() -> str:
     """REINFORCE and its peers on every task that REINFORCE was run on."""
-    rows = final("comparison", "comparison_others")
-    others = ("a2c", "ppo", "trpo")
     lines = []
-    for task, budget, runs in by_task(rows):
-        returns = {name: runs[runs["algorithm"] == name]["return"] for name in ("reinforce", *others)}
-        if len(returns["reinforce"]):
-            lines.append([f"{task} ({short(budget)})", *map(counted, returns.values()), published(task, *others)])
+    for task, budget, runs in by_task(final("comparison", "comparison_others")):
+        if "reinforce" in set(runs["algorithm"]):
+            lines.append([*beside_peers(task, budget, runs), published(task, *PEERS)])
     header = ["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO", "published [steps]"]
     return markdown(header, lines)
 
@@ -50,7 +57,7 @@ def natural() -> str:
 
 
 def seconds() -> str:
-    """The seconds of a core that the runs took, on the seeds that all have."""
+    """The CPU seconds that the runs took, on the seeds that all have."""
     rows = final("comparison").query("seed < 5")
     lines = []
     for task, runs in rows[rows["algorithm"].isin(["reinforce", "a2c", "ppo"])].groupby("task", sort=False):
@@ -83,13 +90,9 @@ def searches() -> str:
 
 def readme() -> str:
     """The README's small table."""
-    rows = final("comparison")
-    lines = []
-    for task in README_TASKS:
-        same = rows[rows["task"] == task]
-        cells = [counted(same[same["algorithm"] == name]["return"]) for name in ("reinforce", "a2c", "ppo")]
-        lines.append([f"{task} ({short(same['budget'].iloc[0])})", *cells])
-    return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO"], lines)
+    rows = final("comparison", "comparison_others").groupby(["task", "budget"])
+    lines = [beside_peers(task, budget, rows.get_group((task, budget))) for task, budget in README_TASKS.items()]
+    return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO"], lines)
 
 
 def memory() -> str:
@@ -202,7 +205,7 @@ def peers() -> str:
     for name, runs in rows.groupby("contender", sort=False):
         ratio = (rates["REINFORCE"] / rates[name]).median()
         lines.append([name, f"{ratio:.1f}", *(number(runs[column].median(), 0) for column in ("steps", "seconds"))])
-    return markdown(["", "REINFORCE's steps per second / its own", "steps to the return", "seconds of a core"], lines)
+    return markdown(["", "speed-up of REINFORCE", "steps to the return", "CPU seconds"], lines)
 
 
 def images() -> str:
@@ -232,12 +235,3 @@ def processes_model() -> str:
     ratios = (rows[rows["kind"] == "model"].set_index(["milliseconds", "number"])["rate"] / measured).unstack()
     lines = [[f"{ms:g} ms", *(f"{ratio:.2f}" for ratio in row)] for ms, row in ratios.iterrows()]
     return markdown(["a step takes", *(f"{n} process{'es' * (n > 1)}" for n in ratios)], lines)
-
-
-def all_tables() -> dict[str, str]:
-    """What pages write as ``{{ name }}``."""
-    functions = (
-        comparison, natural, seconds, machines, searches, memory, t_maze, masks, masks_speed, search_vs_ars,
-        common_random_numbers, noise_scale, search_throughput, throughput, images, peers, processes, processes_model,
-    )  # fmt: skip
-    return {function.__name__: function() for function in functions}

@@ -33,15 +33,15 @@ def changes(task: str, text: str) -> str:
     return ", ".join(f"`{key}={value}`" for key, value in theirs.items() if ours[key] != value)
 
 
-def table() -> str:
+def runs() -> str:
     """The returns of each variant, by task, on the seeds of the choice and on the reported ones."""
     rows = read("tuning").query("algorithm == 'reinforce'")
     reported = final("comparison", "comparison_others").query("algorithm == 'reinforce'")
     lines = []
-    for (task, budget, text), runs in rows.groupby(["task", "budget", "settings"], sort=False):
+    for (task, budget, text), same in rows.groupby(["task", "budget", "settings"], sort=False):
         variant = changes(str(task), text)
-        shown = runs[runs["seed"] < 100] if variant else reported.query("task == @task and budget == @budget")
-        cells = [counted(each["return"]) for each in (runs[runs["seed"] >= 100], shown)]
+        shown = same[same["seed"] < 100] if variant else reported.query("task == @task and budget == @budget")
+        cells = [counted(each["return"]) for each in (same[same["seed"] >= 100], shown)]
         lines.append([f"{task} ({short(int(budget))})", variant or "as shipped", *cells])
     lines.sort(key=lambda line: (line[0], line[1] != "as shipped"))
     return markdown(["task (steps)", "changes to the shipped settings", "seeds from 100 on", "reported seeds"], lines)

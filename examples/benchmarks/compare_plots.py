@@ -3,7 +3,7 @@ What a comparison shows: tables, learning curves, and a summary by rliable (inte
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 
-Writes results_curves.png (the interquartile mean of the seeds against steps, and against seconds of a core, of the
+Writes results_curves.png (the interquartile mean of the seeds against steps, and against CPU seconds, of the
 seeds that all algorithms were run on) and results_summary.png (interquartile mean, performance profiles and probability
 of improvement over all tasks), and prints the final evaluations as a Markdown table. In the summary 0 is a random
 policy and 1 the Zoo's published PPO; it has the algorithms that were run on every task.
@@ -75,7 +75,12 @@ def draw_curves(results: pd.DataFrame) -> None:
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
         axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
-        axes[1].set(title=task, xlabel="seconds of a core", xscale="symlog")
+        axes[1].set(title=task, xlabel="CPU seconds", xscale="symlog")
+        for axis in axes:
+            # The bands of early runs that fail would leave the lines little height
+            values = np.concatenate([line.get_ydata() for line in axis.get_lines()])
+            margin = 0.05 * np.ptp(values)
+            axis.set_ylim(values.min() - margin, values.max() + margin)
     for axis in pairs[len(tasks) :].flat:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task
@@ -152,7 +157,7 @@ def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[st
 def table(results: pd.DataFrame) -> str:
     """The final evaluations: median over the seeds, least and greatest, and the median of the seconds."""
     lines = [
-        "| task (steps) | algorithm | seeds | return: median (least, greatest) | seconds of a core |",
+        "| task (steps) | algorithm | seeds | return: median (least, greatest) | CPU seconds |",
         "|---|---|---|---|---|",
     ]
     final = results[results["evaluation"] == "final"]

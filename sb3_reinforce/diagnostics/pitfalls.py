@@ -81,8 +81,8 @@ def rate_too_large(history: History) -> str | None:
     remedy = f"Lower {argument} (now {value:.2g})"
     if steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1):
         return (
-            f"The policy leaps: its KL divergence from one update to the next is {steps[-1]:.2g} (median of the last "
-            f"{len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or let it decay"
+            f"The policy changes too much per update: the KL divergence of the last one is {steps[-1]:.2g} (median of "
+            f"the last {len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or use a falling schedule"
         )
     if before - after > 0.5 and updates[-1].temperature > 0.9 * updates[0].temperature:
         return (
@@ -123,8 +123,7 @@ def too_few_episodes(history: History) -> str | None:
         shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "
-            f"{shown}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}: 20 episodes "
-            "or more are usual"
+            f"{shown}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}"
         )
     return None
 

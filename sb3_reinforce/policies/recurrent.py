@@ -45,7 +45,7 @@ class MultiInputLstmPolicy(RecurrentPolicy, RecurrentMultiInputActorCriticPolicy
 
 class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy):
     """
-    A recurrent policy that takes no action which the observation forbids.
+    A recurrent policy that never takes a masked action.
 
     :param args: As for :class:`~sb3_reinforce.MaskedPolicy`
     :param kwargs: As for :class:`~sb3_reinforce.MaskedPolicy` and :class:`MlpLstmPolicy`
