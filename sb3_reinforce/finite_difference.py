@@ -244,9 +244,8 @@ class FiniteDifference(BasePolicyGradient):
         iteration = 0
         while self.num_timesteps < total_timesteps:
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            try:
-                estimate = self.estimate_gradient(callback)
-            except Stopped:
+            estimate = self.estimate_gradient(callback)
+            if estimate is None:
                 break
             self.train(estimate)
             iteration += 1
@@ -255,13 +254,12 @@ class FiniteDifference(BasePolicyGradient):
         callback.on_training_end()
         return self
 
-    def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate:
+    def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate | None:
         """
         Perturb θ, evaluate the candidates and estimate ∇U(θ). The policy stays as it is.
 
         :param callback: Called at each step, and at the beginning and end of the rollout
-        :return: ĝ, and the evaluations that it was estimated from
-        :raises Stopped: If the callback returns False
+        :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them
         :raises ValueError: As ``learn``
         """
         callback.on_rollout_start()
@@ -285,7 +283,10 @@ class FiniteDifference(BasePolicyGradient):
             self.policy.set_training_mode(False)
             with frozen(self.get_vec_normalize_env()) as observed:
                 utility = EpisodicUtility(self, searched, callback, observed, first_seed)
-                gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
+                try:
+                    gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
+                except Stopped:
+                    return None
                 if not utility.values:
                     raise ValueError("estimator must call the utility at least once: it has evaluated no candidate")
         finally:

@@ -13,11 +13,11 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
+from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.evaluation import Route
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.collection import Bools
 from sb3_reinforce.sampling.columns import Columns
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
@@ -178,7 +178,7 @@ class RecurrentREINFORCE(REINFORCE):
             starts = th.as_tensor(self._episode_starts(), device=self.device)
             self._state = None
             if self._next_state is not None and not starts.all():
-                self._state = self._next_state[: self.n_envs].to(self.device) * ~starts[(...,) + (None,) * 4]
+                self._state = self._next_state[: self.n_envs].to(self.device) * ~starts[..., None, None, None, None]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
         self._actor = make_recurrent_actor(policy, state, self._episode_starts, with_log_prob)
         return self._actor
@@ -204,7 +204,7 @@ class RecurrentREINFORCE(REINFORCE):
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
         if state is not None and self._next_state is not None:
             goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
-            state[:, 1] = self._next_state[: len(state), 1].to(self.device) * goes_on[(...,) + (None,) * 3]
+            state[:, 1] = self._next_state[: len(state), 1].to(self.device) * goes_on[..., None, None, None]
         rows = rows_of(obs_as_tensor(buffer.observations, self.device), th.as_tensor(dones).to(self.device), state)
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T

@@ -32,7 +32,8 @@ from sb3_reinforce.common.settings import (
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import has_given_seeds, start_episodes, start_groups
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
-from sb3_reinforce.estimation.weights import Batch, Running, complete_rollout, in_finished_episode, training_batch
+from sb3_reinforce.estimation.rollout import Running, in_finished_episode
+from sb3_reinforce.estimation.weights import Batch, complete_rollout, training_batch
 from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
 from sb3_reinforce.policies.evaluation import (
     Parameters,
@@ -261,7 +262,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._make_critic_optimizer()
         self._present_parameters: tuple[tuple[int, bool], ...] = ()
         self._parameter_groups: tuple[Parameters, Parameters, Parameters] = ([], [], [])
-        self._scheduled("ent_coef")
         self._apply_temperature_and_floor()
 
     def _make_critic_optimizer(self) -> None:
@@ -385,7 +385,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         next_values = None
         if route.with_critic:
             buffer.values, next_values = self._evaluate_critic(route, buffer, columns)
-        return complete_rollout(
+        rollout, buffer.advantages, buffer.returns = complete_rollout(
             buffer,
             self.policy,
             columns.dones,
@@ -401,6 +401,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             normalize_by=self.normalize_by,
             episodes_per_start=self.episodes_per_start,
         )
+        return rollout
 
     def collect_part(self, callback: BaseCallback) -> None:
         self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
@@ -442,11 +443,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if with_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
             loss = loss + self.vf_coef * F.mse_loss(values, batch.returns)
-        grad_norm = 0.0
+        grad_norm = kl = 0.0
         # An actor may be frozen while its critic warms up
         if actor and loss.requires_grad:
             gradients = th.autograd.grad(loss, actor, allow_unused=True)
-            grad_norm = self._step_policy(route, batch, actor, gradients, log_prob.detach())
+            grad_norm, kl = self._step_policy(route, batch, actor, gradients, log_prob.detach())
         # A model that is saved now will be loaded with the temperature of the progress made
         self._apply_temperature_and_floor()
         self._n_updates += 1
@@ -455,6 +456,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.logger.record("train/entropy_loss", -entropy.mean().item())
         self.logger.record("train/policy_loss", policy_loss.item())
         self.logger.record("train/grad_norm", grad_norm)
+        self.logger.record("train/kl", kl)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if batch.values is not None:
@@ -462,8 +464,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _step_policy(
         self, route: Route, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor
-    ) -> float:
-        """One step against the gradients of the loss; ``log_prob`` is log π before it."""
+    ) -> tuple[float, float]:
+        """Step against the gradients; return their norm and the divergence. ``log_prob`` is log π before the step."""
         if self.step == "natural":
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
             # The divergence is one of the policy that acts
@@ -480,8 +482,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
                 grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
             kl = sampled_divergence(self.policy, route, obs, actions, log_prob)
-        self.logger.record("train/kl", kl)
-        return grad_norm
+        return grad_norm, kl
 
     def _train_critic(
         self, route: Route, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float

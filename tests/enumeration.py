@@ -82,7 +82,7 @@ def rollout_of(model, batch):
         route = route_of(model.policy, with_critic=True)
         buffer.values = values_along(model.policy, route, buffer)
         next_values = values_after(model.policy, route, buffer.values, dones, buffer.observations[-1], {})
-    rollout = complete_rollout(
+    rollout, *_ = complete_rollout(
         buffer,
         model.policy,
         dones,

@@ -22,7 +22,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.diagnostics import sample
 from sb3_reinforce.diagnostics.baseline_comparison import baseline_rows, compare_baselines, functions_of
 from sb3_reinforce.diagnostics.tables import resamples
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_of
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--seed", type=int, default=0)
@@ -42,7 +42,7 @@ def seconds(function):
 def plain_passes(rollout):
     """The loop over episodes; that they lie ready is not part of its time."""
     episodes = []
-    for number in th.unique(rollout.episodes[rollout.used]):
+    for number in rollout.used_episodes:
         steps = rollout.used & (rollout.episodes == number)
         actions = as_policy_actions(rollout.actions[steps], rollout.policy.action_space)
         episodes.append((rollout.observations[steps], actions, rollout.returns[steps].float()))
@@ -50,7 +50,7 @@ def plain_passes(rollout):
     def run():
         for obs, actions, returns in episodes:
             rollout.policy.optimizer.zero_grad()
-            (log_prob_and_entropy(rollout.policy, obs, actions)[0] * returns).sum().backward()
+            (log_prob_of(rollout.policy, obs, actions) * returns).sum().backward()
 
     return run
 

@@ -36,7 +36,7 @@ def batch_gradients(rollout: Rollout) -> th.Tensor:
 def batches_of(model: REINFORCE, size: int, n_batches: int) -> Iterator[th.Tensor]:
     """Gradients of batches of so many episodes, shape (n_batches, n_baselines, n); no episode is in two of them."""
     rollout = sample(model, size * n_batches)
-    for episodes in th.unique(rollout.episodes[rollout.used]).split(size):
+    for episodes in rollout.used_episodes.split(size):
         yield batch_gradients(replace(rollout, used=rollout.used & th.isin(rollout.episodes, episodes)))
 
 

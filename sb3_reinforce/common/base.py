@@ -22,7 +22,7 @@ Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
 LOAD_ARGUMENTS = {"custom_objects", "print_system_info", "force_reset"}
-# What a state dict of either algorithm may have
+# The names in REINFORCE's parameters; FiniteDifference lacks the last
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
 
@@ -48,8 +48,9 @@ class BasePolicyGradient(Distributed):
         verbose = verbose if is_leader() else 0
         kwargs |= {"policy": policy, "policy_kwargs": policy_kwargs, "verbose": verbose}
         # Stable-Baselines3 uses some arguments as soon as it has them
-        for name in kwargs.keys() & self._arguments.keys():
-            self._arguments[name](name, kwargs[name])
+        for name, check in self._arguments.items():
+            if name in kwargs:
+                check(name, kwargs[name])
         self._check_policy(policy)
         if needs_env or env is not None:
             env = check_env(env, verbose)
@@ -65,9 +66,8 @@ class BasePolicyGradient(Distributed):
         self.lr_schedule = self._schedule("learning_rate")
 
     def _renew_lr_schedule(self) -> None:
-        """Follow another learning rate that a callback has set."""
-        held = self._schedules.get("learning_rate")
-        if held is not None and held.given != self.learning_rate:
+        """Follow another learning rate that a callback has set, unless the user has replaced the schedule itself."""
+        if isinstance(self.lr_schedule, CheckedSchedule):
             self._setup_lr_schedule()
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
@@ -226,17 +226,17 @@ class BasePolicyGradient(Distributed):
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
         names = self._get_torch_save_params()[0]
         allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
-        if not states.keys() <= allowed or (exact_match and len(states) < len(names)):
+        own: dict[str, Any] = {name: states[name] for name in names if name in states}
+        if not states.keys() <= allowed or not own or (exact_match and len(own) < len(names)):
             raise ValueError(
                 f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing "
                 f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
             )
-        own: dict[str, Any] = {name: states[name] for name in names if name in states}
         for name, state in own.items():
             if not isinstance(state, Mapping):
                 raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
         # A mask that a user's policy adds to its logits may well be infinite
-        storage.check_finite(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
+        storage.check_finite_state(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())
         try:
             # The policy comes first, and with it a mismatch that is named by its parameters

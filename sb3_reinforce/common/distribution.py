@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_reinforce.common.processes import Finished, Processes, is_leader, place
+from sb3_reinforce.common.processes import Finished, Processes, is_leader, rank_and_size
 from sb3_reinforce.common.settings import ATTRIBUTES
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
@@ -31,7 +31,7 @@ def together(learn: Learn) -> Learn:
 
     @wraps(learn)
     def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:
-        if place() == (0, 1):
+        if rank_and_size() == (0, 1):
             return learn(model, *args, **kwargs)
         with Processes() as processes:
             model._processes = processes
@@ -57,7 +57,7 @@ class Distributed(BaseAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators and environments: ``seed`` plus the environment's index among all W·n."""
-        rank, _ = place()
+        rank, _ = rank_and_size()
         if rank > 0:
             # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions
             seed = (th.initial_seed() % 2**31 if seed is None else seed) + rank * self.n_envs

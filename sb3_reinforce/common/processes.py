@@ -38,7 +38,7 @@ class Finished(Exception):
     """Process 0 has finished learning; the argument is its last state."""
 
 
-def place() -> tuple[int, int]:
+def rank_and_size() -> tuple[int, int]:
     """The number of this process and W, the number of all, which learn together; (0, 1) if it learns alone."""
     if os.environ.get(SWITCH) != "0" and dist.is_available():
         if dist.is_initialized():
@@ -54,7 +54,7 @@ def is_leader() -> bool:
 
     :return: False in the processes 1, 2, ... that ``python -m torch.distributed.run`` has started
     """
-    return place()[0] == 0
+    return rank_and_size()[0] == 0
 
 
 class Processes:
@@ -64,7 +64,7 @@ class Processes:
         if not dist.is_initialized():
             # Process 0 may evaluate for hours before it calls learn() again
             dist.init_process_group("gloo", timeout=timedelta(days=365))
-        self.rank, self.size = place()
+        self.rank, self.size = rank_and_size()
         self.lines: dict[Any, int] = {}
         # Whether the others have yet to send their parts of a rollout, and the state that these started from
         self.in_round = False

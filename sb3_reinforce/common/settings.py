@@ -26,7 +26,7 @@ from sb3_reinforce.common.arguments import (
     optional,
     unknown_name,
 )
-from sb3_reinforce.common.processes import place
+from sb3_reinforce.common.processes import rank_and_size
 
 Functions = Mapping[str, Callable[..., Any]]
 
@@ -38,19 +38,21 @@ MAX_SEED = 2**32 - 1
 MAX_TEMPERATURE = 1e6
 # Noise this strong drowns the mean
 MAX_STD = 1e6
-STACK_FRAMES = "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
-MASK = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
+USE_RECURRENT = (
+    "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
+)
+USE_MASKED_POLICY = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
-CONTRIB_POLICIES = dict.fromkeys(RECURRENT, STACK_FRAMES) | {"MaskableActorCriticPolicy": MASK}
-ONE_STEP = "it takes one policy step per rollout, which max_grad_norm alone bounds"
-OPTIMIZER = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
+CONTRIB_POLICIES = dict.fromkeys(RECURRENT, USE_RECURRENT) | {"MaskableActorCriticPolicy": USE_MASKED_POLICY}
+NO_CLIPPING = "it takes one policy step per rollout, which max_grad_norm alone bounds"
+USE_POLICY_KWARGS = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead
 INSTEAD_OF_PPO = {
     "n_epochs": "it takes one policy step per rollout; n_critic_updates is the number of the critic's passes",
-    "clip_range": ONE_STEP,
-    "clip_range_vf": ONE_STEP,
-    "use_rms_prop": OPTIMIZER,
-    "rms_prop_eps": OPTIMIZER,
+    "clip_range": NO_CLIPPING,
+    "clip_range_vf": NO_CLIPPING,
+    "use_rms_prop": USE_POLICY_KWARGS,
+    "rms_prop_eps": USE_POLICY_KWARGS,
 }
 
 
@@ -146,7 +148,9 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
             # It was checked when it was made, and a function of the user may be slow
             continue
         value = check(name, given)
-        if not isinstance(value, CheckedSchedule):
+        if isinstance(value, CheckedSchedule):
+            model._schedules[name] = value
+        else:
             setattr(model, attribute, value)
     check_subclass("policy", model.policy_class, ActorCriticPolicy)
     space = model.observation_space
@@ -157,14 +161,12 @@ def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
 def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
-    function = check_function("baseline", model.baseline, baselines)
-    # A function of this package has the limits of its name
-    model.baseline = next((name for name, each in baselines.items() if each is function), function)
+    model.baseline = check_named("baseline", model.baseline, baselines)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
             model.n_steps = 32
         else:
-            n_envs = model.n_envs * place()[1]
+            n_envs = model.n_envs * rank_and_size()[1]
             model.n_episodes = n_envs if model.shares_starts else max(16, n_envs)
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
@@ -187,10 +189,16 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
 
 
+def check_named(name: str, value: Any, functions: Functions) -> Any:
+    """Return the user's own function, or the name of one of ours, which has the limits of its name."""
+    function = check_function(name, value, functions)
+    return next((each for each, known in functions.items() if known is function), function)
+
+
 def check_starts(model: Any) -> None:
     """Check that the episodes of a rollout can share their starts, as the model and its environments are now."""
     m = model.episodes_per_start
-    n_episodes = model.n_envs * place()[1]
+    n_episodes = model.n_envs * rank_and_size()[1]
     if m == 1:
         return
     if model.n_steps is not None or model.n_episodes != n_episodes or model.n_envs % m:
@@ -209,7 +217,7 @@ def check_starts(model: Any) -> None:
 def check_finite_difference(model: Any, estimators: Functions, perturbations: Functions) -> None:
     """Check the arguments of a FiniteDifference."""
     check_attributes(model, FINITE_DIFFERENCE_ARGUMENTS)
-    check_function("estimator", model.estimator, estimators)
+    model.estimator = check_named("estimator", model.estimator, estimators)
     check_function("perturbation", model.perturbation, perturbations)
     if model.policy_kwargs.get("use_sde"):
         raise ValueError("policy_kwargs must not have use_sde=True: FiniteDifference perturbs parameters, not actions")

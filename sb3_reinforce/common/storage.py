@@ -75,7 +75,7 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> set[str]:
     return attributes
 
 
-def check_finite(state: Any, infinite: set[str], name: str = "") -> None:
+def check_finite_state(state: Any, infinite: set[str], name: str = "") -> None:
     """Check the numbers of a nested state; those with a name in ``infinite`` may be infinite, but not NaN."""
     if isinstance(state, (th.Tensor, float)):
         number = th.as_tensor(state)
@@ -84,7 +84,7 @@ def check_finite(state: Any, infinite: set[str], name: str = "") -> None:
     elif isinstance(state, (Mapping, list, tuple)):
         parts = state.items() if isinstance(state, Mapping) else enumerate(state)
         for key, part in parts:
-            check_finite(part, infinite, f"{name}.{key}")
+            check_finite_state(part, infinite, f"{name}.{key}")
 
 
 def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) -> str:

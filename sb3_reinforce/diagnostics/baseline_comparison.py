@@ -161,7 +161,7 @@ def relative_bias(baseline: Baseline, rollout: Rollout) -> float:
 
 def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
     """``K_ij = ⟨g_i, g_j⟩`` (m, m) for weights (n_steps, n_envs) by baseline, ``"none"`` first, and the ``"floor"``."""
-    n_episodes = len(th.unique(rollout.episodes[rollout.used]))
+    n_episodes = len(rollout.used_episodes)
     found = {name: th.zeros(n_episodes, n_episodes, dtype=th.float64) for name in (*weights, "floor")}
     for scores, *gradients in gradient_blocks(rollout, rollout.discounts, *weights.values()):
         for name, each in zip(weights, gradients, strict=True):
@@ -173,7 +173,7 @@ def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> dict[str, 
 def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
     """``gradients_by_episode`` in blocks ``(k, m, c)`` of c components of θ, at most ``floats`` numbers each."""
     n_parameters = sum(parameter.numel() for parameter in parameters_of(rollout))
-    n_columns = max(1, floats // (len(weights) * len(th.unique(rollout.episodes[rollout.used]))))
+    n_columns = max(1, floats // (len(weights) * len(rollout.used_episodes)))
     for start in range(0, n_parameters, n_columns):
         yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))
 

@@ -3,24 +3,24 @@
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
-from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy, set_temperature, temperature_of, trainable
+from sb3_reinforce.policies.evaluation import log_prob_of, temperature_of, trainable
 
 
 class Diagnosis(BaseCallback):
@@ -32,14 +32,14 @@ class Diagnosis(BaseCallback):
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
         self.last_model: Any = None
-        self.forget()
+        self._forget()
 
     def _init_callback(self) -> None:
         if self.model is not self.last_model:
             self.last_model = self.model
-            self.forget()
+            self._forget()
 
-    def forget(self) -> None:
+    def _forget(self) -> None:
         """Start with a model of which nothing is known."""
 
     def _on_step(self) -> bool:
@@ -87,7 +87,8 @@ class GradientQualityCallback(Diagnosis):
         super().__init__(verbose)
         self.every = check_integer("every", every, 1)
         self.max_episodes = check_integer("max_episodes", max_episodes, 2)
-        self.baselines = baselines
+        # An iterator would be empty at the second call of learn
+        self.baselines = list(baselines) if isinstance(baselines, Iterator) else baselines
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -95,7 +96,7 @@ class GradientQualityCallback(Diagnosis):
             check_model(self.model, independent=True)
             self.functions = functions_of(self.model, self.baselines)
 
-    def forget(self) -> None:
+    def _forget(self) -> None:
         """Start with a model of which nothing is known."""
         self.n_rollouts = 0
         self.thetas: deque[th.Tensor] = deque(maxlen=3)
@@ -125,8 +126,13 @@ class GradientQualityCallback(Diagnosis):
             self.logger.record(f"gradient/{key}", figure)
 
     def measure(self, rollout: Rollout) -> dict[str, float]:
-        """The figures of one rollout, before training on it."""
-        n_episodes = len(th.unique(rollout.episodes[rollout.used]))
+        """
+        Compute what is logged of a rollout, apart from the cosine.
+
+        :param rollout: The rollout, before the model trains on it
+        :return: The figures by the last part of their key
+        """
+        n_episodes = len(rollout.used_episodes)
         # Episodes that share their start are not independent
         if n_episodes < 2 or rollout.episodes_per_start > 1:
             return {}
@@ -150,7 +156,7 @@ class PitfallCallback(Diagnosis):
 
     The pitfalls: a learning rate that is too large, returns that are not scaled, too few episodes, the total return,
     gradients that spike without clipping, a critic that explains nothing, a policy that is deterministic too early, and
-    episodes that are cut. They are detected from what training computes anyway; the cost is three forward passes and a
+    episodes that are cut. They are detected from what training computes anyway; the cost is two forward passes and a
     backward pass over at most 256 steps of a rollout. Training is not changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
@@ -159,7 +165,7 @@ class PitfallCallback(Diagnosis):
     :raises TypeError: If the model is not a REINFORCE
     """
 
-    # Steps behind a KL divergence, and components of a gradient that are kept
+    # Steps that are looked at, and components of a gradient that are kept
     N_STEPS = 256
     N_COMPONENTS = 10_000
 
@@ -167,7 +173,7 @@ class PitfallCallback(Diagnosis):
         check_model(self.model)
         super()._init_callback()
 
-    def forget(self) -> None:
+    def _forget(self) -> None:
         """Start with a model of which nothing is known."""
         self.found: dict[str, str] = {}
         self.updates: deque[Update] = deque(maxlen=50)
@@ -182,11 +188,9 @@ class PitfallCallback(Diagnosis):
         self.rollout = rollout
         policy = rollout.policy
         is_first = rollout.used & (rollout.used.flatten().cumsum(0).view_as(rollout.used) <= self.N_STEPS)
-        self.obs = select(rollout.inputs, is_first)
-        self.actions = as_policy_actions(select(rollout.actions, is_first), policy.action_space)
+        self.obs, actions = used_inputs(replace(rollout, used=is_first))
         self.temperature = temperature_of(policy)
-        log_prob, _ = log_prob_and_entropy(policy, self.obs, self.actions)
-        self.log_prob = log_prob.detach()
+        log_prob = log_prob_of(policy, self.obs, actions)
         self.gradient = th.zeros(0)
         if log_prob.requires_grad:
             weights = select(training_weights(self.model), is_first).to(log_prob)
@@ -194,16 +198,16 @@ class PitfallCallback(Diagnosis):
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
 
     def _on_rollout_start(self) -> None:
-        self.examine()
+        self._examine()
 
     def _on_training_end(self) -> None:
-        self.examine()
+        self._examine()
 
-    def examine(self) -> None:
+    def _examine(self) -> None:
         """Add the update after the last rollout to the history, and warn of new pitfalls."""
         if self.rollout is None or not self.logger.name_to_value:
             return
-        self.updates.append(self.update(self.rollout))
+        self.updates.append(self._update(self.rollout))
         self.n_updates += 1
         self.rollout = None
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.total_timesteps)
@@ -216,24 +220,19 @@ class PitfallCallback(Diagnosis):
                 warnings.warn(sentence, stacklevel=2)
 
     @th.no_grad()
-    def update(self, rollout: Rollout) -> Update:
+    def _update(self, rollout: Rollout) -> Update:
         """What is known of the last update, which was computed from this rollout."""
         logged = self.logger.name_to_value
         returns = rollout.returns[rollout.used]
-        present = temperature_of(rollout.policy)
-        # A falling temperature changes log π too, whatever the step
-        set_temperature(rollout.policy, self.temperature)
-        log_prob, _ = log_prob_and_entropy(rollout.policy, self.obs, self.actions)
-        set_temperature(rollout.policy, present)
         return Update(
-            kl=float((self.log_prob - log_prob).mean()),
+            kl=logged.get("train/kl", 0.0),
             randomness=randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan)),
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,
             return_scale=float(returns.square().mean().sqrt()),
             return_std=float(returns.std(correction=0)),
-            n_episodes=len(th.unique(rollout.episodes[rollout.used])),
+            n_episodes=len(rollout.used_episodes),
             n_steps=len(returns),
             used_fraction=len(returns) / rollout.used.numel(),
             temperature=self.temperature,

@@ -87,7 +87,9 @@ def compare_estimators(
     """
     check_model(model, (REINFORCE, FiniteDifference), independent=True)
     names = (estimators,) if isinstance(estimators, str) else tuple(estimators)
-    for name in names or ("",):
+    if not names:
+        raise ValueError("estimators must have at least one name")
+    for name in names:
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
     check_integer("n_episodes", n_episodes, 3)
     check_integer("n_estimates", n_estimates, 3)

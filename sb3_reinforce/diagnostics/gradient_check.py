@@ -7,7 +7,6 @@ import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_reinforce.common.arguments import check_function, check_integer
-from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.policy_errors import (
     largest_difference,
@@ -20,10 +19,10 @@ from sb3_reinforce.diagnostics.policy_errors import (
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
-from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.estimation.weights import by_step
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import undisturbed
@@ -119,13 +118,12 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
         rollout = collect_episodes(collector)
     policy = rollout.policy
     parameters_of(rollout)
-    obs = select(rollout.inputs, rollout.used)
-    actions = as_policy_actions(select(rollout.actions, rollout.used), model.action_space)
+    obs, actions = used_inputs(rollout)
     some_obs, some_actions = spread(policy, obs, actions)
     if isinstance(policy, RecurrentPolicy):
         # Its ``forward`` has no sequences: log π is compared as it was when the episodes were played
         played = select(th.as_tensor(collector.rollout_buffer.log_probs), rollout.used)
-        difference = largest_difference(log_prob_and_entropy(policy, obs, actions)[0].detach().cpu(), played)
+        difference = largest_difference(log_prob_of(policy, obs, actions).detach().cpu(), played)
     else:
         difference = log_prob_error(policy, some_obs)
     return {
@@ -157,7 +155,7 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
 def return_error(collector: REINFORCE, rollout: Rollout) -> float:
     """The largest difference between a return and its definition, relative to the largest return."""
     expected = th.zeros_like(rollout.returns)
-    for episode in th.unique(rollout.episodes[rollout.used]):
+    for episode in rollout.used_episodes:
         steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
         values = np.zeros(len(steps)) if rollout.next_values is None else rollout.next_values[steps, envs].numpy()
         rewards = rollout.rewards[steps, envs].numpy()
@@ -168,7 +166,7 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """``‖w − (G − b)‖ / ‖w‖`` over the used steps, where training reads w from the rollout buffer."""
+    """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
     baseline = check_function("baseline", collector.baseline, BASELINES)
     expected = (rollout.returns - baseline(rollout).cpu()) * rollout.used
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)

@@ -120,6 +120,8 @@ def landscape(
     check_integer("n_points", n_points, 2)
     utility = CandidateUtility(model, n_episodes, seed)
     n = len(utility.theta)
+    if not utility.theta.any():
+        raise ValueError("landscape needs parameters that are not all 0: the directions get their norm")
     gradients = {} if gradients is None else gradients
     check_kind("gradients", gradients, (Mapping,), "a dictionary of tensors by name")
     if directions is None:

@@ -13,7 +13,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
-from sb3_reinforce.policies.evaluation import Parameters, log_prob_and_entropy, trainable
+from sb3_reinforce.policies.evaluation import Parameters, log_prob_of, trainable
 from sb3_reinforce.policies.parameters import write
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
@@ -34,7 +34,7 @@ def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
 def log_prob_error(policy: ActorCriticPolicy, obs: PyTorchObs) -> float:
     """The largest difference between log π of sampled actions in ``forward`` and in training."""
     drawn, _, log_prob = policy(obs)
-    evaluated, _ = log_prob_and_entropy(policy, obs, as_evaluated(policy, drawn))
+    evaluated = log_prob_of(policy, obs, as_evaluated(policy, drawn))
     return largest_difference(evaluated, log_prob)
 
 
@@ -70,7 +70,7 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     signs = 2.0 * th.randint(2, (len(actions),)).to(actions.device) - 1
 
     def objective() -> th.Tensor:
-        return (log_prob_and_entropy(policy, obs, actions)[0].double() * signs).sum()
+        return (log_prob_of(policy, obs, actions).double() * signs).sum()
 
     gradient = to_vector(th.autograd.grad(objective(), parameters, allow_unused=True, materialize_grads=True)).double()
     theta = to_vector(parameters)
@@ -139,7 +139,7 @@ def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) ->
 def closeness_after_step(policy: ActorCriticPolicy, one: PyTorchObs, action: th.Tensor, n: int) -> th.Tensor:
     """``closeness`` before and after a step along the score of an action, (2,), with the same n random draws."""
     parameters = score_parameters(policy, one, action[None])
-    log_prob, _ = log_prob_and_entropy(policy, one, action[None])
+    log_prob = log_prob_of(policy, one, action[None])
     gradient = to_vector(th.autograd.grad(log_prob.sum(), parameters))
     theta = to_vector(parameters)
     # To first order, log π(a|s) rises by 0.3

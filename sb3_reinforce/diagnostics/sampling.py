@@ -83,8 +83,8 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
             policy.set_training_mode(training)
 
 
-def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> VecEnv:
-    """Check the kind of a model, or also that its episodes are independent samples, and return its environments."""
+def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> None:
+    """Check the kind of a model, that it has environments, or also that its episodes are independent samples."""
     check_kind("model", model, kinds, f"a {' or '.join(kind.__name__ for kind in kinds)}")
     if independent and model.use_sde and model.sde_sample_freq != 1:
         raise ValueError(
@@ -92,7 +92,7 @@ def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent:
             "are not independent samples. Measure a model with sde_sample_freq=1, or "
             "without use_sde"
         )
-    return env_of(model)
+    env_of(model)
 
 
 def env_of(model: BaseAlgorithm) -> VecEnv:
@@ -113,7 +113,7 @@ def training_weights(model: REINFORCE) -> th.Tensor:
 
 def evenly_spread(rollout: Rollout, n_episodes: int) -> Rollout:
     """A rollout of which only ``n_episodes`` episodes are used, spread evenly over the environments."""
-    numbers = th.unique(rollout.episodes[rollout.used])
+    numbers = rollout.used_episodes
     if len(numbers) <= n_episodes:
         return rollout
     kept = numbers[th.linspace(0, len(numbers) - 1, n_episodes).round().long()]

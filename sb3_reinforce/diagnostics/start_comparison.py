@@ -70,7 +70,8 @@ def compare_starts(
     :raises ValueError: If an argument is out of its range, if the episodes are not independent because they share the
         noise of gSDE, or if an environment does not start alike from the same seed
     """
-    env = check_model(model, independent=True)
+    check_model(model, independent=True)
+    env = env_of(model)
     step = env.num_envs // math.gcd(env.num_envs, N_PER_START)
     n_starts = math.ceil(check_integer("n_starts", n_starts, 4) / step) * step
     check_number("confidence", confidence, 0, 1)
@@ -80,7 +81,7 @@ def compare_starts(
         # G_t and m_t, (n_steps, n_starts, N_PER_START)
         returns = by_start([rollout.returns * rollout.used for rollout in rollouts])
         used = by_start([rollout.used.double() for rollout in rollouts])
-        grams = gram_matrices(rollouts, returns, used)
+        grams = group_grams(rollouts, returns, used)
     single = variance(compute_moments(grams[1], counts))
     # The mean of N/m independent groups: tr Σ_m / (N/m), against tr Σ_1 / N
     gains = {m: interval(single / (m * variance(compute_moments(grams[m], counts))), confidence) for m in SIZES}
@@ -110,24 +111,24 @@ def by_start(parts: list[th.Tensor]) -> th.Tensor:
     return padded.reshape(len(padded), -1, N_PER_START)
 
 
-def leave_one_out(returns: th.Tensor, used: th.Tensor, dim: int) -> th.Tensor:
+def mean_of_others(returns: th.Tensor, used: th.Tensor, dim: int) -> th.Tensor:
     """``b_t``, the mean of G_t over the others along ``dim`` that reach step t, and 0 where there is none."""
     totals = returns.sum(dim, keepdim=True) - returns
     counts = used.sum(dim, keepdim=True) - used
     return totals / counts.clamp(min=1)
 
 
-def gram_matrices(rollouts: list[Rollout], returns: th.Tensor, used: th.Tensor) -> dict[int, th.Tensor]:
+def group_grams(rollouts: list[Rollout], returns: th.Tensor, used: th.Tensor) -> dict[int, th.Tensor]:
     """
     By m, what ``compute_moments`` takes of the mean gradient Γ of m episodes that are each other's baseline.
 
     ``⟨E_s Γ, E_r Γ⟩`` for starts s ≠ r, and ``E_s ‖Γ‖²`` on the diagonal, both ``(n_starts, n_starts)``.
     """
     # An episode alone has its baseline from the other starts
-    baselines = {1: leave_one_out(returns, used, dim=1)}
+    baselines = {1: mean_of_others(returns, used, dim=1)}
     for m in SIZES:
         groups = (*returns.shape[:2], -1, m)
-        baselines[m] = leave_one_out(returns.reshape(groups), used.reshape(groups), dim=3).reshape(returns.shape)
+        baselines[m] = mean_of_others(returns.reshape(groups), used.reshape(groups), dim=3).reshape(returns.shape)
     residuals = (returns - th.stack(list(baselines.values()))) * used
     # Equal returns differ from their mean by rounding
     weights = th.where(residuals.abs() > ROUNDING * returns.abs().max(), residuals, 0.0).flatten(2)

@@ -68,8 +68,11 @@ class Table(Generic[Row]):
         """The first column."""
         return [str(getattr(row, self.columns[0])) for row in self.rows]
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
     def __getitem__(self, name: str) -> Row:
-        if name not in self.names:
+        if name not in self:
             raise ValueError(f"{self.columns[0]} must be one of {', '.join(map(repr, self.names))}, got {name!r}")
         return self.rows[self.names.index(name)]
 

@@ -53,7 +53,7 @@ def has_given_seeds(env: VecEnv) -> bool:
 def separate(env: VecEnv) -> None:
     """Give environments with given seeds new and different ones, from their next reset on."""
     if has_given_seeds(env):
-        # Measurements seed PyTorch's generator, with which training would go on from the same starts after each
+        # By NumPy's generator: measurements seed PyTorch's, and training would repeat its starts after each of them
         reseed(env, np.random.randint(2**31))
         setattr(env.unwrapped, MARK, False)
 

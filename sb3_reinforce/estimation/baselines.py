@@ -119,9 +119,8 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖²: in float32 equal returns c would have a baseline that differs from c
     level = group_means(rollout)
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
-    numbers = th.unique(rollout.episodes[rollout.used])
     n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
-    for group in numbers.split(max(1, CHUNK // (2 * n_parameters))):
+    for group in th.split(rollout.used_episodes, max(1, CHUNK // (2 * n_parameters))):
         part = replace(rollout, used=rollout.used & th.isin(rollout.episodes, group))
         weights = rollout.discounts * (rollout.returns - level)
         weighted, scores = gradients_by_episode(part, weights, rollout.discounts)

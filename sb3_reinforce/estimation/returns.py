@@ -49,7 +49,7 @@ def lambda_return(
 
     :param rewards: Shape ``(n_steps, n_envs)``
     :param dones: Shape ``(n_steps, n_envs)``
-    :param next_values: Shape ``(n_steps, n_envs)``
+    :param next_values: V(s_{t+1}), shape ``(n_steps, n_envs)``, or one number for all
     :param gamma: Discount factor γ
     :param gae_lambda: λ: 1 is the Monte Carlo return, 0 the one-step return
     :return: Shape ``(n_steps, n_envs)``, float64

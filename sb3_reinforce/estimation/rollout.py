@@ -9,6 +9,8 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import select
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, reward_to_go, total_return
 from sb3_reinforce.policies.sequences import RecurrentPolicy, episode_numbers, rows_of
 
@@ -58,6 +60,12 @@ class Rollout:
         return episode_numbers(self.dones)
 
     @property
+    def used_episodes(self) -> th.Tensor:
+        """The numbers of the m episodes with used steps, ascending, shape ``(m,)``, int64."""
+        numbers: th.Tensor = th.unique(self.episodes[self.used])
+        return numbers
+
+    @property
     def groups(self) -> th.Tensor:
         """
         The number of the group whose returns are compared, shape ``(n_steps, n_envs)``, int64.
@@ -74,6 +82,12 @@ class Rollout:
         if isinstance(self.policy, RecurrentPolicy):
             return rows_of(self.observations, self.dones.to(self.actions.device), self.state)
         return self.observations
+
+
+def used_inputs(rollout: Rollout) -> tuple[Any, th.Tensor]:
+    """The used steps in a row, as the policy is evaluated on them: its inputs and the actions."""
+    actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
+    return select(rollout.inputs, rollout.used), actions
 
 
 @dataclass(frozen=True)
@@ -114,7 +128,7 @@ def in_finished_episode(dones: Bools) -> Bools:
 
 
 def timesteps_of(dones: Bools, first: Integers) -> Integers:
-    """t within the episode, ``(n_steps, n_envs)``: the row less the row of the episode's start, ``−first`` at first."""
+    """t within the episode, ``(n_steps, n_envs)``: the row minus that of its start, at first ``−first``."""
     rows = np.arange(len(dones))[:, None]
     starts = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
     return rows - np.maximum.accumulate(starts, axis=0)

@@ -19,12 +19,12 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten, select, take, to_vector
-from sb3_reinforce.estimation.rollout import Rollout
+from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.policies.evaluation import (
     Parameters,
     actor_parameters,
     extract_features,
-    log_prob_and_entropy,
+    log_prob_of,
     trainable,
 )
 from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
@@ -50,7 +50,7 @@ def gradients_by_episode(
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
     :param chunk: Floats that an intermediate result may take; the result does not depend on it
     :param columns: The components of θ to return, n in number
-    :return: Shape ``(k, m, n)``
+    :return: Shape ``(k, m, n)``, in the dtype and on the device of the parameters; the episodes are in ascending order
     :raises ValueError: If log π does not depend on any parameter in a way that can be differentiated
     """
     parameters = parameters_of(rollout)
@@ -96,14 +96,8 @@ def sums_by_backward_passes(
     """``Σ_t w_t ∇ log π`` over all steps of an episode, shape ``(k, n)``, by a backward pass for each of k weights."""
     obs, actions = used_inputs(rollout)
     for number, steps in enumerate(steps_of(episode)):
-        log_prob, _ = log_prob_and_entropy(rollout.policy, take(obs, steps), actions[steps])
+        log_prob = log_prob_of(rollout.policy, take(obs, steps), actions[steps])
         yield number, th.stack([vector_jacobian_product(log_prob, parameters, part) for part in w[:, steps]])
-
-
-def used_inputs(rollout: Rollout) -> tuple[PyTorchObs, th.Tensor]:
-    """The observations and actions of the used steps in a row."""
-    actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
-    return select(rollout.inputs, rollout.used), actions
 
 
 def vector_jacobian_product(log_prob: th.Tensor, parameters: Parameters, w: th.Tensor) -> th.Tensor:
@@ -142,7 +136,9 @@ def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
     is_shared = len({id(parameter) for parameter in parameters}) < len(parameters)
-    own_std = isinstance(policy.action_dist, DiagGaussianDistribution) and not isinstance(policy.log_std, nn.Parameter)
+    own_std = isinstance(policy.action_dist, DiagGaussianDistribution) and not (
+        isinstance(policy.log_std, nn.Parameter) and policy.log_std.dim() == 1
+    )
     return None if is_shared or own_std else layers
 
 

@@ -11,11 +11,17 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
-from sb3_reinforce.estimation.rollout import Rollout, Running, in_finished_episode, timesteps_of, within_quota
+from sb3_reinforce.estimation.rollout import (
+    Rollout,
+    Running,
+    in_finished_episode,
+    timesteps_of,
+    used_inputs,
+    within_quota,
+)
 
 # Differences between returns of less than this part of them are rounding errors
 ROUNDING = 1e-12
@@ -37,9 +43,9 @@ def complete_rollout(
     discount_scores: bool,
     normalize_by: str,
     episodes_per_start: int = 1,
-) -> Rollout:
+) -> tuple[Rollout, Floats, Floats]:
     """
-    m_t, G_t, γ^t and D of what was collected; ``G_t − b_t`` and what a critic is fitted to are written to the buffer.
+    What was collected, with m_t, G_t, γ^t and D; ``G_t − b_t``; and what a critic is fitted to, or without one G_t.
 
     ``quota`` is None for a fixed number of steps, and ``next_values`` None without a critic.
     """
@@ -49,16 +55,17 @@ def complete_rollout(
     returns_to_go = lambda_return(rewards, dones, 0.0 if next_values is None else next_values, gamma, gae_lambda)
     returns = returns_to_go if reward_to_go else total_return(returns_to_go, timesteps, gamma, running.rewards)
     # The total return has γ^t already
-    exponents = timesteps * (discount_scores and reward_to_go)
+    discounts = gamma**timesteps if discount_scores and reward_to_go else np.ones_like(returns)
     rollout = Rollout(
         observations=obs_as_tensor(buffer.observations, policy.device),
         actions=th.as_tensor(buffer.actions, device=policy.device),
         rewards=th.as_tensor(rewards).double(),
         dones=th.as_tensor(dones),
         timesteps=th.as_tensor(timesteps),
+        # A copy: PyTorch takes no array with negative strides
         used=th.as_tensor(used.copy()),
         returns=th.tensor(returns),
-        discounts=th.as_tensor(gamma**exponents),
+        discounts=th.as_tensor(discounts),
         values=None if next_values is None else th.as_tensor(buffer.values).double(),
         next_values=None if next_values is None else th.as_tensor(next_values).double(),
         policy=policy,
@@ -66,9 +73,8 @@ def complete_rollout(
         episodes_per_start=episodes_per_start,
         state=state,
     )
-    buffer.advantages = compute_advantages(rollout, baseline(rollout))
-    buffer.returns = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
-    return rollout
+    targets = np.where(used, returns if next_values is None else returns_to_go, 0.0).astype(np.float32)
+    return rollout, compute_advantages(rollout, baseline(rollout)), targets
 
 
 def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_critic: bool) -> tuple[Bools, int]:
@@ -135,9 +141,10 @@ def training_batch(rollout: Rollout, buffer: RolloutBuffer, normalize: bool) -> 
     """The used steps of a rollout, with the advantages and returns of the buffer, which a callback may have changed."""
     advantages, returns = by_step(buffer)
     used = rollout.used
+    observations, actions = used_inputs(rollout)
     return Batch(
-        observations=select(rollout.inputs, used),
-        actions=as_policy_actions(select(rollout.actions, used), rollout.policy.action_space),
+        observations=observations,
+        actions=actions,
         weights=compute_weights(rollout, advantages, normalize),
         returns=select(th.as_tensor(returns, device=rollout.actions.device), used),
         values=None if rollout.values is None else select(rollout.values, used),

@@ -132,9 +132,9 @@ def evaluate(
     return log_prob, entropy, None if values is None else values.flatten()
 
 
-def log_prob_and_entropy(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """log π(a|s) and the entropy of π(·|s), each of shape ``(n,)``, without evaluating the critic."""
-    return evaluate(policy, route_of(policy), obs, actions, with_values=False)[:2]
+def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+    """log π(a|s), shape ``(n,)``, without evaluating the critic."""
+    return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
 
 
 def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
@@ -199,7 +199,7 @@ def trainable(policy: ActorCriticPolicy) -> Parameters:
 
 def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that log π depends on, in the policy's order."""
-    return reached_by(log_prob_and_entropy(policy, obs, actions)[0], trainable(policy))
+    return reached_by(log_prob_of(policy, obs, actions), trainable(policy))
 
 
 def reached_by(output: th.Tensor, parameters: Parameters) -> Parameters:

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import torch as th
 from torch import nn
 
-from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.arguments import check_choice, check_integer
 
 State: TypeAlias = tuple[th.Tensor, th.Tensor]
 
@@ -31,8 +31,7 @@ MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
 
 def check_memory(memory: Any, lstm_kwargs: Any, **kwargs: Any) -> None:
     """Check the arguments of a recurrent policy that Stable-Baselines3 does not know."""
-    if memory not in MEMORIES:
-        raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory!r}")
+    check_choice("memory", memory, tuple(MEMORIES))
     for name in ("lstm_hidden_size", "n_lstm_layers"):
         check_integer(name, kwargs.get(name, 1), 1)
     allowed = {"bias", "dropout"} | ({"nonlinearity"} if memory == "rnn" else set())

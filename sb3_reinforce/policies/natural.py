@@ -54,6 +54,7 @@ def natural_step(
         return norm, 0.0
     divergence = divergence_from_now(policy, obs)
     fisher_product = hessian_vector_product(divergence(), parameters)
+    # α undoes the scale of g
     d = conjugate_gradients(lambda v: fisher_product(v) + DAMPING * v, g / norm)
     curvature = float(d @ fisher_product(d))
     kl = None
@@ -95,7 +96,12 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
 
 def hessian_vector_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
     """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994)."""
-    slopes = th.autograd.grad(output, parameters, create_graph=True)
+    slopes = th.autograd.grad(output, parameters, create_graph=True, allow_unused=True)
+    if any(slope is None for slope in slopes):
+        raise ValueError(
+            "step='natural' needs the distribution of the actions, and get_distribution does not depend on all "
+            "parameters that log π depends on: use step='optimizer'"
+        )
     slope = th.cat([each.flatten() for each in slopes])
     return lambda v: to_vector(th.autograd.grad(slope @ v, parameters, retain_graph=True))
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import actor_parameters, log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import actor_parameters, log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 
@@ -30,7 +30,7 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
             parameters = actor_parameters(policy, obs, actions)
         with th.no_grad():
             # A policy keeps its last distribution, and with the graph in it could not be deep-copied
-            log_prob_and_entropy(policy, obs, actions)
+            log_prob_of(policy, obs, actions)
     finally:
         policy.set_training_mode(training)
     log_std = getattr(policy, "log_std", None)

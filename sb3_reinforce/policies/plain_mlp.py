@@ -26,15 +26,15 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from torch import nn
 from torch.nn import functional as F
 
-Floats: TypeAlias = NDArray[np.float32]
+Float32s: TypeAlias = NDArray[np.float32]
 
 DISTRIBUTIONS = (BernoulliDistribution, CategoricalDistribution, DiagGaussianDistribution, MultiCategoricalDistribution)
 ELEMENTWISE = (
-    *(nn.Tanh, nn.ReLU, nn.Identity, nn.ELU, nn.SELU, nn.CELU, nn.SiLU, nn.GELU, nn.Mish, nn.Sigmoid, nn.LogSigmoid),
-    *(nn.LeakyReLU, nn.ReLU6, nn.Softplus, nn.Softsign, nn.Hardtanh, nn.Hardswish, nn.Hardsigmoid, nn.Tanhshrink),
-)
+    nn.Tanh, nn.ReLU, nn.Identity, nn.ELU, nn.SELU, nn.CELU, nn.SiLU, nn.GELU, nn.Mish, nn.Sigmoid, nn.LogSigmoid,
+    nn.LeakyReLU, nn.ReLU6, nn.Softplus, nn.Softsign, nn.Hardtanh, nn.Hardswish, nn.Hardsigmoid, nn.Tanhshrink,
+)  # fmt: skip
 # The activations that NumPy computes, each in place
-IN_PLACE: dict[type[nn.Module], Callable[[Floats], Floats]] = {
+IN_PLACE: dict[type[nn.Module], Callable[[Float32s], Float32s]] = {
     nn.Tanh: lambda x: np.tanh(x, out=x),
     nn.ReLU: lambda x: np.maximum(x, 0, out=x),
 }
@@ -181,7 +181,7 @@ def has_numpy_form(layers: list[nn.Module]) -> bool:
     return all(parameter.dtype is th.float32 and parameter.device.type == "cpu" for parameter in parameters)
 
 
-def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Floats]:
+def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Float32s]:
     """
     Plain layers as one function from ``n`` observations to outputs of shape ``(n, n_out)``.
 
@@ -189,14 +189,15 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
     that changes in place count at once. The next call may overwrite the result.
     """
     operations = [
-        linear_operation(layer, n) if isinstance(layer, nn.Linear) else IN_PLACE[type(layer)] for layer in layers
+        linear_operation(layer.weight, layer.bias, n) if isinstance(layer, nn.Linear) else IN_PLACE[type(layer)]
+        for layer in layers
     ]
     hooks = temperature_hooks(layers[-1])
 
     # As PyTorch, without warnings: some BLAS kernels read beyond the end of an array and flag what they find there
     @np.errstate(all="ignore")
-    def outputs(obs: np.ndarray) -> Floats:
-        x: Floats = obs.reshape(n, -1).astype(np.float32, copy=False)
+    def outputs(obs: np.ndarray) -> Float32s:
+        x: Float32s = obs.reshape(n, -1).astype(np.float32, copy=False)
         for operation in operations:
             x = operation(x)
         return x / np.float32(hooks[0].temperature) if hooks else x
@@ -204,20 +205,20 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
     return outputs
 
 
-def linear_operation(layer: nn.Linear, n: int) -> Callable[[Floats], Floats]:
+def linear_operation(weight: th.Tensor, bias: th.Tensor, n: int) -> Callable[[Float32s], Float32s]:
     """``x Wᵀ + b`` as a function of x of shape ``(n, n_in)``, written to memory that is used again at each call."""
-    weight = layer.weight.detach()
+    weight, bias = weight.detach(), bias.detach()
     transposed = weight.numpy().T
-    bias = layer.bias.detach().numpy()
-    y = np.empty((n, layer.out_features), dtype=np.float32)
+    addend = bias.numpy()
+    y = np.empty((n, len(weight)), dtype=np.float32)
 
-    def by_numpy(x: Floats) -> Floats:
+    def by_numpy(x: Float32s) -> Float32s:
         np.dot(x, transposed, y)
-        np.add(y, bias, y)
+        np.add(y, addend, y)
         return y
 
-    def by_torch(x: Floats) -> Floats:
-        th.addmm(layer.bias.detach(), th.from_numpy(x), weight.T, out=th.from_numpy(y))
+    def by_torch(x: Float32s) -> Float32s:
+        th.addmm(bias, th.from_numpy(x), weight.T, out=th.from_numpy(y))
         return y
 
     return by_torch if n * weight.numel() > ONE_THREAD else by_numpy

@@ -210,7 +210,7 @@ def rows_of(obs: Any, dones: th.Tensor, state: th.Tensor | None) -> Rows:
     rows: Rows = {"observations": obs, "sequence": sequence}
     if state is not None:
         goes_on = sequence == sequence[0]
-        rows["state"] = state * goes_on[(...,) + (None,) * 4]
+        rows["state"] = state * goes_on[..., None, None, None, None]
     return rows
 
 

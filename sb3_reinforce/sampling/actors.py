@@ -22,7 +22,7 @@ from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.policies.evaluation import Route, has_own_forward
-from sb3_reinforce.policies.plain_mlp import HOOKS, Floats, has_numpy_form, numpy_forward, overrides, takes_vectors
+from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, overrides, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
@@ -70,8 +70,8 @@ class NumpyActor:
         self.shape = (n_envs, *(policy.action_space.shape or ()))
         self.forward = numpy_forward(layers, n_envs)
         self.sample = sampler_of(policy, n_envs)
-        self.outputs: list[Floats] = []
-        self.log_stds: list[Floats] = []
+        self.outputs: list[Float32s] = []
+        self.log_stds: list[Float32s] = []
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
         self.distribution = policy.action_dist
@@ -133,7 +133,7 @@ def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_pr
     return PolicyActor(policy, route, with_log_prob)
 
 
-def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Floats], np.ndarray]:
+def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Float32s], np.ndarray]:
     """
     Draws actions from logits or means of shape ``(n_envs, width)``.
 
@@ -150,21 +150,21 @@ def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Floats], np.
     samplers = [categorical_sampler(n_envs, dim) for dim in distribution.action_dims]
     cuts = np.cumsum(distribution.action_dims)[:-1]
 
-    def sample(logits: Floats) -> np.ndarray:
+    def sample(logits: Float32s) -> np.ndarray:
         parts = np.split(logits, cuts, axis=1)
         return np.stack([draw(part) for draw, part in zip(samplers, parts, strict=True)], axis=1)
 
     return sample
 
 
-def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[Floats], Floats]:
+def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[Float32s], Float32s]:
     """``a = mean + σ ε`` with normal ε."""
     noise = th.empty(n_envs, width)
     epsilon = noise.numpy()
     log_sigma = log_std.detach().numpy()
     sigma = np.empty_like(log_sigma)
 
-    def sample(means: Floats) -> Any:
+    def sample(means: Float32s) -> Any:
         noise.normal_()
         np.exp(log_sigma, sigma)
         np.multiply(epsilon, sigma, epsilon)
@@ -173,12 +173,12 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
     return sample
 
 
-def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Floats], np.ndarray]:
+def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Float32s], np.ndarray]:
     """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
     noise = th.empty(n_envs, n_actions)
     scores = noise.numpy()
 
-    def sample(logits: Floats) -> Any:
+    def sample(logits: Float32s) -> Any:
         noise.exponential_()
         np.log(scores, scores)
         np.subtract(logits, scores, scores)

@@ -95,7 +95,7 @@ def evaluate_candidates(
     max_episode_steps: int,
     on_step: Callable[[CandidateStep], None],
 ) -> np.ndarray:
-    """The returns Σ_t r_t, unscaled, of candidates ``(m, n)`` from seeds ``(m, n_episodes)``, in the seeds' shape."""
+    """The returns Σ_t r_t, unscaled, of candidates ``(m, n)``, shape ``(m, n_episodes)``; so are seeds, or None."""
     vec_normalize = unwrap_vec_normalize(env)
     original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
     returns = np.zeros((len(thetas), n_episodes))

@@ -47,6 +47,7 @@ class Extent:
     @classmethod
     def fixed(cls, n_steps: int, n_envs: int) -> "Extent":
         """The same number of steps in every environment, and as many episodes as end in them."""
+        # A step ends at most one episode
         return cls(np.full(n_envs, n_steps), n_steps=n_steps)
 
     @classmethod

@@ -8,9 +8,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_reinforce.common.tensors import map_parts, take
-from sb3_reinforce.estimation.returns import Integers
-from sb3_reinforce.sampling.collection import ROWS, Bools, TerminalObs
+from sb3_reinforce.common.tensors import map_parts
+from sb3_reinforce.estimation.returns import Bools, Integers
+from sb3_reinforce.sampling.collection import ROWS, TerminalObs
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,19 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         for number, columns in enumerate(all_columns)
         for (step, env), obs in columns.terminal_obs.items()
     ]
-    states = [columns.state for columns in all_columns if columns.state is not None]
-    # A process whose environments all start episodes has none
-    state = [th.zeros_like(states[0]) if columns.state is None else columns.state for columns in all_columns if states]
+    states = [columns.state for columns in all_columns]
+    known = next((state for state in states if state is not None), None)
     return Columns(
         # An episode that ends beyond the quota does not count, and the padding ends none
         dones=side_by_side([columns.dones for columns in all_columns], n_steps),
         # In the order of one process: the last bit of a batch's values may depend on it
         terminal_obs=dict(sorted(terminal_obs, key=lambda item: item[0])),
-        last_obs=take(side_by_side([take(columns.last_obs, None) for columns in all_columns], 1), 0),
+        last_obs=map_parts(lambda *parts: np.concatenate(parts), *(columns.last_obs for columns in all_columns)),
         quota=np.concatenate([columns.quota for columns in all_columns]),
-        state=th.cat(state).to(device) if state else None,
+        # A process whose environments all start episodes has no state
+        state=None
+        if known is None
+        else th.cat([th.zeros_like(known) if each is None else each for each in states]).to(device),
     )
 
 

@@ -13,7 +13,7 @@ from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import (
     has_numpy_form,
     is_unchanged,
-    numpy_forward,
+    linear_operation,
     plain_actor,
     takes_vectors,
 )
@@ -78,8 +78,8 @@ class LstmCell:
 
     def __init__(self, lstm: Any, state: th.Tensor):
         self.hidden, self.cell = (half.numpy().copy() for half in state[:, :, 0].unbind(1))
-        self.from_obs = numpy_forward([linear_of(lstm.weight_ih_l0, lstm.bias_ih_l0)], len(state))
-        self.from_hidden = numpy_forward([linear_of(lstm.weight_hh_l0, lstm.bias_hh_l0)], len(state))
+        self.from_obs = linear_operation(lstm.weight_ih_l0, lstm.bias_ih_l0, len(state))
+        self.from_hidden = linear_operation(lstm.weight_hh_l0, lstm.bias_hh_l0, len(state))
         # σ(x) = ½ tanh(½ x) + ½ for three gates, and tanh itself for g
         self.scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], dtype=np.float32), lstm.hidden_size)
         self.shift = 1 - self.scale
@@ -95,19 +95,12 @@ class LstmCell:
         if starts.any():
             self.hidden[starts] = 0
             self.cell[starts] = 0
-        gates = self.from_obs(obs) + self.from_hidden(self.hidden)
+        x = obs.reshape(len(obs), -1).astype(np.float32, copy=False)
+        gates = self.from_obs(x) + self.from_hidden(self.hidden)
         i, f, g, o = np.split(np.tanh(gates * self.scale) * self.scale + self.shift, 4, axis=1)
         self.cell = f * self.cell + i * g
         self.hidden = o * np.tanh(self.cell)
         return self.hidden
-
-
-def linear_of(weight: nn.Parameter, bias: nn.Parameter) -> nn.Linear:
-    """A linear layer with given parameters."""
-    layer: nn.Linear = nn.utils.skip_init(nn.Linear, *reversed(weight.shape))  # type: ignore[no-untyped-call]
-    layer.weight = weight
-    layer.bias = bias
-    return layer
 
 
 RecurrentActor: TypeAlias = RecurrentPolicyActor | LstmActor

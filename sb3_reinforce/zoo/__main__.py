@@ -19,7 +19,7 @@ from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
 from sb3_reinforce.common.arguments import unknown_name
-from sb3_reinforce.common.processes import Processes, is_leader, place
+from sb3_reinforce.common.processes import Processes, is_leader, rank_and_size
 from sb3_reinforce.zoo import ALGORITHMS
 from sb3_reinforce.zoo.experiments import ConfigurationError
 
@@ -62,7 +62,7 @@ def run_script(command: str) -> None:
 @contextlib.contextmanager
 def one_of_several(arguments: list[str]) -> Iterator[list[str]]:
     """The arguments of ``train`` with a seed that all processes share; process 0 alone prints and keeps its folder."""
-    if place() == (0, 1):
+    if rank_and_size() == (0, 1):
         yield arguments
         return
     with Processes() as processes:

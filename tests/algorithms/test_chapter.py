@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_of
 
 
 class ScriptedPolicy(ActorCriticPolicy):
@@ -54,7 +54,7 @@ def test_actions_with_returns_8_10_12():
 
 
 def gradient_of_log_prob(policy, obs, action, parameter):
-    log_prob, _ = log_prob_and_entropy(policy, obs, action)
+    log_prob = log_prob_of(policy, obs, action)
     return th.autograd.grad(log_prob.sum(), parameter)[0]
 
 

@@ -371,7 +371,7 @@ def test_a_critic_warms_up_while_the_actor_is_frozen():
         module.requires_grad_(False)
     moved = moved_by_learning(model, 16)
     assert "value_net.weight" in moved and all("value_net" in name for name in moved)
-    assert model.logger.name_to_value["train/grad_norm"] == 0
+    assert model.logger.name_to_value["train/grad_norm"] == model.logger.name_to_value["train/kl"] == 0
 
 
 class Exponential(th.nn.Module):
@@ -414,7 +414,7 @@ def test_a_critic_without_parameters():
 
 @pytest.mark.parametrize(("n_envs", "n_processes", "n_episodes"), [(1, 1, 16), (20, 1, 20), (10, 2, 20)])
 def test_by_default_each_environment_has_an_episode(n_envs, n_processes, n_episodes, monkeypatch):
-    monkeypatch.setattr(settings, "place", lambda: (0, n_processes))
+    monkeypatch.setattr(settings, "rank_and_size", lambda: (0, n_processes))
     env = make_vec_env("CartPole-v1", n_envs)
     assert REINFORCE("MlpPolicy", env, baseline="none", device="cpu").n_episodes == n_episodes
     recurrent = RecurrentREINFORCE("MlpLstmPolicy", env, device="cpu")

@@ -16,11 +16,12 @@ from gymnasium.wrappers import TransformObservation
 from models import OwnPrediction, Scaled, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimation import central_difference
+from sb3_reinforce.estimation import ESTIMATORS, central_difference
 from sb3_reinforce.estimation.perturbations import default_delta_std
 
 SMALL = dict(n_delta=3, estimator="central", seed=0, device="cpu")
@@ -183,6 +184,16 @@ def test_vec_normalize_is_frozen_in_an_update_and_learns_between(norm_obs):
         assert env.obs_rms.count == count and not env.training
 
 
+def test_a_stopped_update_leaves_its_observations_in_the_statistics():
+    env = VecNormalize(make_vec_env("CartPole-v1", 2))
+    model = make(env).learn(1000, At(7))
+    assert model._n_updates == 0 and env.obs_rms.count == pytest.approx(2 + model.num_timesteps, abs=1e-3)
+    model.set_logger(Logger(None, []))
+    callback = At(1)
+    callback.init_callback(model)
+    assert model.estimate_gradient(callback) is None
+
+
 def test_utilities_are_sums_of_rewards_before_their_scaling():
     env = VecNormalize(make_vec_env("CartPole-v1", 2), norm_reward=True)
     env.ret_rms.var = np.array(100.0)
@@ -249,6 +260,12 @@ def test_too_few_perturbations_for_a_regression_are_said():
     with pytest.warns(UserWarning, match="n_delta=4 perturbations do not determine the gradient of 8") as warned:
         model.learn(1)
     assert warned[0].filename == __file__
+
+
+@pytest.mark.parametrize("estimator", ["regression", "central"])
+def test_an_estimator_of_this_package_is_the_same_as_a_function(estimator):
+    named, function = (make(estimator=each, n_delta=None) for each in (estimator, ESTIMATORS[estimator]))
+    assert named.n_delta == function.n_delta and function.estimator == estimator
 
 
 def test_the_rule_of_thumb():

@@ -25,7 +25,7 @@ from sb3_reinforce.diagnostics import check_gradient, compare_baselines, landsca
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
-from sb3_reinforce.policies.evaluation import log_prob_and_entropy
+from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.recurrent import MlpLstmPolicy, RecurrentREINFORCE
 
 GAMMA = 0.5
@@ -73,7 +73,7 @@ def estimate(model, batch):
     dones = np.array([[False] * len(batch), [True] * len(batch)])
     buffer.full = True
     model.rollout_buffer = buffer
-    model.rollout = complete_rollout(
+    model.rollout, buffer.advantages, buffer.returns = complete_rollout(
         buffer,
         model.policy,
         dones,
@@ -168,7 +168,7 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
     for (rollout, last_obs, log_probs), (own, own_next) in zip(records.records, values, strict=True):
         # The actor's steps and the sequences of training have one log π
         actions = rollout.actions.flatten().long()
-        trained_on, _ = log_prob_and_entropy(model.policy, flatten(rollout.inputs), actions)
+        trained_on = log_prob_of(model.policy, flatten(rollout.inputs), actions)
         np.testing.assert_allclose(trained_on.detach(), log_probs.ravel(), atol=1e-6)
         for t, env in product(range(len(rollout.dones)), range(2)):
             running[env].append(take(rollout.observations, (t, env)))
@@ -324,7 +324,7 @@ def observing(space):
         (observing(spaces.MultiDiscrete([2, 3])), "observation_space must have no MultiDiscrete"),
         (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "MultiDiscrete part, .* as a Box, got Dict"),
         (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
-        (memory(memory="LSTM"), "memory must be one of lstm, gru, rnn"),
+        (memory(memory="LSTM"), "memory must be one of 'lstm', 'gru', 'rnn'"),
         (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
         (
             memory(shared_lstm=True, enable_critic_lstm=False, share_features_extractor=False),
@@ -333,6 +333,7 @@ def observing(space):
         (memory(lstm_hidden_size=0), "lstm_hidden_size must be"),
         (memory(n_lstm_layers=0), "n_lstm_layers must be"),
         (memory(lstm_kwargs={"batch_first": True}), "lstm_kwargs must be a dict with some of bias, dropout"),
+        (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
         (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
         (predict(THREE, TWO_STATES), r"state must be .* of shape \(1, 3, 4\)"),
         (predict(THREE, 3), "state must be .*; got 3"),

@@ -22,7 +22,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
 from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARGUMENTS, REINFORCE_ARGUMENTS
-from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation import BASELINES, ESTIMATORS
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
@@ -156,6 +156,7 @@ RECURRENT, MASKABLE = (
         ("steps", {"target_kl": 0.01}, ["target_kl=0.01", "step='optimizer'", "'natural'"]),
         ("steps", {"use_sde": True}, ["gSDE"]),
         ("search", {"estimator": "regression", "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
+        ("search", {"estimator": ESTIMATORS["regression"], "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
         ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),
         ("search", {"n_top": 1, "estimator": "forward"}, ["n_top=1", "'central'", "'forward'"]),
         ("search", {"policy": th.nn.Linear}, ["policy", "ActorCriticPolicy", "Linear"]),
@@ -167,6 +168,13 @@ def test_arguments_that_do_not_go_together(kind, wrong, words):
     with pytest.raises((ValueError, TypeError)) as error:
         make(kind, **wrong)
     assert all(word in str(error.value) for word in words)
+
+
+def test_of_several_wrong_arguments_the_same_is_named_in_every_process():
+    """Those that Stable-Baselines3 uses at once come first, in the order of the table."""
+    wrong = {name: -1 for name in ("seed", "stats_window_size", "ent_coef", "gae_lambda", "gamma", "vf_coef")}
+    with pytest.raises(ValueError, match=r"^stats_window_size"):
+        make("steps", **wrong)
 
 
 @pytest.mark.parametrize("other", [A2C, PPO])
@@ -253,6 +261,8 @@ def test_a_schedule_is_called_once_where_its_value_is_needed_once():
     n_before = len(seen)
     model.learn(80)
     assert len(seen) - n_before == model._n_updates == 10
+    # At both ends of a training, and what it is at its start
+    assert n_before <= 4
 
 
 @both

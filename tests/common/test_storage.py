@@ -213,6 +213,7 @@ def not_finite(state):
 
 
 WRONG = {
+    "nothing": lambda p: {},
     "an unknown name": lambda p: {**p, "foo": {}},
     "a method's name": lambda p: {**p, "learn": {}},
     "no optimizer": lambda p: {"policy": p["policy"]},

@@ -87,6 +87,14 @@ def test_a_single_name_is_an_estimator():
     assert compare_estimators(bandit(), 10, 3, "central", progress_bar=True).names == ["central"]
 
 
+def test_a_landscape_around_zero_has_no_scale():
+    model = bandit()
+    for parameter in model.policy.parameters():
+        parameter.data.zero_()
+    with pytest.raises(ValueError, match="not all 0"):
+        landscape(model, 10)
+
+
 def test_a_landscape_rises_along_the_gradient():
     model = bandit()
     with th.no_grad():

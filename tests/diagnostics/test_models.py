@@ -211,7 +211,7 @@ MISTAKES = {
         ({"delta_std": 0.0}, "delta_std"),
         ({"n_delta": 1}, "n_delta must be at least 2"),
         ({"estimators": "backward"}, "estimators must be one of.*'backward'"),
-        ({"estimators": ()}, "estimators must be one of"),
+        ({"estimators": ()}, "estimators must have at least one name"),
         ({"perturbation": "cube"}, "perturbation must be"),
         ({"confidence": 95}, "confidence"),
     ],

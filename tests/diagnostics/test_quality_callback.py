@@ -48,7 +48,7 @@ def test_episodes_of_one_start_are_not_taken_for_independent():
 
 
 def test_it_serves_one_model_after_another():
-    callback = GradientQualityCallback(1)
+    callback = GradientQualityCallback(1, iter(["mean"]))
     (_, first), (_, second) = (train(callback) for _ in range(2))
     assert first == second
 

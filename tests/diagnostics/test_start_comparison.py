@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_starts
-from sb3_reinforce.diagnostics.start_comparison import by_start, gram_matrices, sample_starts
+from sb3_reinforce.diagnostics.start_comparison import by_start, group_grams, sample_starts
 from sb3_reinforce.diagnostics.statistics import gram
 from sb3_reinforce.estimation import gradients_by_episode, leave_one_out
 
@@ -59,7 +59,7 @@ def test_ragged_episodes_have_the_gradients_of_training(env):
     returns = by_start([rollout.returns * rollout.used for rollout in rollouts])
     used = by_start([rollout.used.double() for rollout in rollouts])
     assert not used.all()
-    grams = gram_matrices(rollouts, returns, used)
+    grams = group_grams(rollouts, returns, used)
     for m in (2, 4, 8):
         means = []
         for rollout in rollouts:

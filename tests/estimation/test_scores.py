@@ -71,6 +71,14 @@ class Branching(ActorCriticPolicy):
         return values, log_prob * (2.0 if float(obs.sum()) > 0 else 1.0), entropy
 
 
+class OneStd(ActorCriticPolicy):
+    """Its actions have one standard deviation, a parameter without dimensions."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.log_std = th.nn.Parameter(th.tensor(-0.3))
+
+
 IMAGES = {"screen_height": 36, "screen_width": 36, "n_channels": 1, "discrete": True}
 POLICIES = {
     "temperature": lambda: collect(Corridor((2, 9)), temperature=0.3),
@@ -81,6 +89,7 @@ POLICIES = {
     "gSDE": lambda: collect(Corridor((2, 9), action_space=BOX), use_sde=True),
     "images": lambda: collect(FakeImageEnv(**IMAGES), "CnnPolicy", n_episodes=2),
     "dicts": lambda: collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2),
+    "one standard deviation": lambda: collect(Corridor((2, 9), action_space=BOX), OneStd),
     "a method that branches": lambda: collect(Corridor((2, 9)), Branching),
 }
 

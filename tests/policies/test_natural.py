@@ -28,7 +28,7 @@ from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies import natural
 from sb3_reinforce.policies.evaluation import (
     action_distribution,
-    log_prob_and_entropy,
+    log_prob_of,
     route_of,
     sampled_divergence,
     some_steps,
@@ -340,7 +340,7 @@ def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one(name):
     log_probs = []
     for state in (model.policy.state_dict(), old.records[0]):
         model.policy.load_state_dict(state)
-        log_probs.append(log_prob_and_entropy(model.policy, batch.observations, batch.actions)[0].double().detach())
+        log_probs.append(log_prob_of(model.policy, batch.observations, batch.actions).double().detach())
     log_ratio = log_probs[0] - log_probs[1]
     expected = float((log_ratio.exp() - 1 - log_ratio).mean())
     assert 1e-6 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-2)
@@ -374,3 +374,23 @@ def test_an_estimate_takes_different_steps(n, expected):
     obs, actions = some_steps(policy, {"numbers": th.arange(n)}, th.arange(n))
     assert len(actions.unique()) == len(actions) == expected
     assert th.equal(obs["numbers"], actions)
+
+
+class Rescaled(ActorCriticPolicy):
+    """Learns from a parameter that ``get_distribution`` does not have."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.scale = th.nn.Parameter(th.ones(()))
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob * self.scale, entropy
+
+
+def test_a_policy_whose_distribution_lacks_a_parameter_is_refused():
+    model = REINFORCE(Rescaled, "CartPole-v1", step="natural", n_steps=32, seed=0)
+    before = to_vector(model.policy.parameters())
+    with pytest.raises(ValueError, match="get_distribution does not depend on all"):
+        model.learn(32)
+    assert th.equal(to_vector(model.policy.parameters()), before)
