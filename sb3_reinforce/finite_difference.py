@@ -1,5 +1,6 @@
 """FiniteDifference as an algorithm of Stable-Baselines3."""
 
+import math
 import warnings
 from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
@@ -15,7 +16,13 @@ from sb3_reinforce.common import optimization
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
+from sb3_reinforce.common.settings import (
+    FINITE_DIFFERENCE_ARGUMENTS,
+    check_finite_difference,
+    check_learn,
+    choose,
+    forget_defaults,
+)
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
@@ -159,6 +166,7 @@ class FiniteDifference(BasePolicyGradient):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        forget_defaults(self)
         check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)
@@ -177,7 +185,7 @@ class FiniteDifference(BasePolicyGradient):
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
-            self.n_delta = default_n_delta(self.estimator, n_parameters)
+            choose(self, "n_delta", default_n_delta(self.estimator, n_parameters))
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""
@@ -209,7 +217,7 @@ class FiniteDifference(BasePolicyGradient):
         self: SelfFiniteDifference,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 10,
+        log_interval: int = 1,
         tb_log_name: str = "FiniteDifference",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
@@ -281,7 +289,7 @@ class FiniteDifference(BasePolicyGradient):
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
-            with frozen(self.get_vec_normalize_env()) as observed:
+            with frozen(self.env) as observed:
                 utility = EpisodicUtility(self, searched, callback, observed, first_seed)
                 try:
                     gradient = check_tensor("estimator", estimator(utility, theta, deltas), (n,))
@@ -331,7 +339,8 @@ class FiniteDifference(BasePolicyGradient):
         self.logger.record("train/delta_std", estimate.delta_std)
         self.logger.record("train/grad_norm", grad_norm)
         self.logger.record("train/r_squared", fit.r_squared)
-        self.logger.record("train/residual_std", fit.residual_std)
+        if not math.isnan(fit.residual_std):
+            self.logger.record("train/residual_std", fit.residual_std)
         if fit.standard_error is not None:
             self.logger.record("train/standard_error", float(fit.standard_error.mean()))
         self.logger.record("rollout/utility_mean", float(utilities.mean()))

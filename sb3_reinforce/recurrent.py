@@ -168,6 +168,8 @@ class RecurrentREINFORCE(REINFORCE):
                 self._next_state = None
             elif self._actor is not None:
                 self._next_state = self._state_after_rollout().cpu()
+            # It cannot be pickled
+            self._actor = None
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
         policy = cast(RecurrentPolicy, self.policy)

@@ -28,6 +28,7 @@ from sb3_reinforce.common.settings import (
     check_learn,
     check_reinforce,
     check_starts,
+    forget_defaults,
 )
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import has_given_seeds, start_episodes, start_groups
@@ -251,6 +252,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return self._scheduled("critic_learning_rate")
 
     def _setup_model(self) -> None:
+        forget_defaults(self)
         check_reinforce(self, BASELINES)
         # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout resizes it
         n_steps = self.n_steps
@@ -527,6 +529,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             model.gae_lambda = 1.0
         # A schedule that the copy renews is still to be renewed here
         model._schedules = dict(self._schedules)
+        model._chosen = {}
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)
@@ -559,11 +562,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
-        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, or processes under
-            torchrun have different arguments; and as in ``collect_rollouts`` and ``train``
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, PyTorch's gradients are
+            turned off, or processes under torchrun have different arguments; and as in ``collect_rollouts`` and
+            ``train``
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if not th.is_grad_enabled():
+            raise ValueError("learn needs gradients, and PyTorch's are turned off: call th.set_grad_enabled(True)")
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

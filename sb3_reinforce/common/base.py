@@ -57,6 +57,8 @@ class BasePolicyGradient(Distributed):
         # A copy: Stable-Baselines3 writes to it
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
+        # What was chosen for arguments that the user has left open
+        self._chosen: dict[str, int] = {}
         super().__init__(env=env, **kwargs)
 
     def _check_policy(self, policy: str | type) -> None:
@@ -166,7 +168,8 @@ class BasePolicyGradient(Distributed):
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
                 "call set_parameters with this path and exact_match=False"
             )
-        arguments = cls._arguments.keys() - ATTRIBUTES.keys()
+        # A subclass may have arguments of its own
+        arguments = (cls._arguments.keys() | signature(cls).parameters.keys()) - ATTRIBUTES.keys()
         unknown = sorted(kwargs.keys() - arguments - saved - LOAD_ARGUMENTS)
         if unknown:
             raise TypeError(

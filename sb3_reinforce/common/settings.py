@@ -164,10 +164,10 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     model.baseline = check_named("baseline", model.baseline, baselines)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
-            model.n_steps = 32
+            choose(model, "n_steps", 32)
         else:
             n_envs = model.n_envs * rank_and_size()[1]
-            model.n_episodes = n_envs if model.shares_starts else max(16, n_envs)
+            choose(model, "n_episodes", n_envs if model.shares_starts else max(16, n_envs))
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
@@ -187,6 +187,20 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")
     elif model.min_std > 0:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
+
+
+def choose(model: Any, name: str, value: int) -> None:
+    """Set an argument that the user has left open."""
+    setattr(model, name, value)
+    model._chosen[name] = value
+
+
+def forget_defaults(model: Any) -> None:
+    """Leave open again what was chosen for a model that was saved: it may be loaded with others."""
+    for name, value in model._chosen.items():
+        if getattr(model, name) == value:
+            setattr(model, name, None)
+    model._chosen.clear()
 
 
 def check_named(name: str, value: Any, functions: Functions) -> Any:

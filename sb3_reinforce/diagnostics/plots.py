@@ -157,7 +157,9 @@ def plot_variances(
     """
     ax = new_axes(ax)
     x = np.asarray(n_episodes, dtype=float)
-    width = NormalDist().inv_cdf((1 + check_number("confidence", confidence, 0, 1)) / 2)
+    if check_number("confidence", confidence, 0, 1) == 1:
+        raise ValueError("confidence must be below 1 for the intervals of a normal distribution, got 1")
+    width = NormalDist().inv_cdf((1 + confidence) / 2)
     for index, (name, given) in enumerate(curves.items()):
         variances = np.asarray(given, dtype=float)
         if variances.ndim != 2 or len(variances) < 2 or variances.shape[1:] != x.shape:

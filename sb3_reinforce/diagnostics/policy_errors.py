@@ -61,6 +61,28 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
 
 def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
+    The larger ``difference_error`` of those at θ and at ``θ + W``, with W ~ N(0, 1/fan-in) for each weight.
+
+    The last layer of a new policy has small weights, with which the scores of the others hardly count at θ.
+    """
+    parameters = trainable(policy)
+    theta = to_vector(parameters)
+    noise = [
+        th.randn_like(each) / math.sqrt(each[0].numel()) if each.dim() > 1 else th.zeros_like(each)
+        for each in parameters
+    ]
+    error = difference_error(policy, obs, actions)
+    write(parameters, theta + to_vector(noise))
+    try:
+        shaken = difference_error(policy, obs, actions)
+    finally:
+        write(parameters, theta)
+    # log π need not be finite there
+    return max(error, shaken) if math.isfinite(shaken) else error
+
+
+def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
+    """
     Relative error of ``⟨∇L, u⟩`` against ``(L(θ + h u) − L(θ − h u)) / 2h`` over random directions u, for the best h.
 
     ``L = Σ ± log π(a_t|s_t)`` with random signs. Where log π is strongly curved, only a short h is accurate; a wrong

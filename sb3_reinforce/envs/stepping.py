@@ -1,10 +1,12 @@
 """
-A ``DummyVecEnv`` stepped without deep copies, and with a check of each observation and reward where it is written.
+A ``DummyVecEnv`` stepped with a check of each observation and reward where it is written.
 
-With 64 CartPoles the deep copies of ``DummyVecEnv.step_wait`` take a fourth of its time.
+Only infos that can change are copied deeply. With 64 CartPoles the deep copies of ``DummyVecEnv.step_wait`` take a
+fourth of its time.
 """
 
 from copy import deepcopy
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,11 @@ from stable_baselines3.common.vec_env.util import dict_to_obs
 
 from sb3_reinforce.envs.checks import as_reward, check_observation
 
+IMMUTABLE = (bool, int, float, str, np.generic, NoneType)
+
 
 def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
-    """What ``env.step_wait()`` returns, with shallow copies of the infos: their values are the environment's own."""
+    """What ``env.step_wait()`` returns."""
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
@@ -29,7 +33,8 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
-        info = {**info, "TimeLimit.truncated": truncated and not terminated}
+        info = {key: value if isinstance(value, IMMUTABLE) else deepcopy(value) for key, value in info.items()}
+        info["TimeLimit.truncated"] = truncated and not terminated
         if terminated or truncated:
             dones[i] = True
             check_observation(env.observation_space, obs, i)

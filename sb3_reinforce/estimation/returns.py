@@ -54,7 +54,7 @@ def lambda_return(
     :param gae_lambda: λ: 1 is the Monte Carlo return, 0 the one-step return
     :return: Shape ``(n_steps, n_envs)``, float64
     """
-    continues = ~dones
+    continues = ~np.asarray(dones, dtype=bool)
     continues[-1] = False
     return discounted_sum(rewards + gamma * (1 - gae_lambda * continues) * next_values, gamma * gae_lambda * continues)
 

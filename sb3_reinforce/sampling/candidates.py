@@ -13,11 +13,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
+from sb3_reinforce.sampling.normalization import original_reward_of
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -96,8 +97,7 @@ def evaluate_candidates(
     on_step: Callable[[CandidateStep], None],
 ) -> np.ndarray:
     """The returns Σ_t r_t, unscaled, of candidates ``(m, n)``, shape ``(m, n_episodes)``; so are seeds, or None."""
-    vec_normalize = unwrap_vec_normalize(env)
-    original = vec_normalize.get_original_reward if vec_normalize is not None and vec_normalize.norm_reward else None
+    original = original_reward_of(env)
     returns = np.zeros((len(thetas), n_episodes))
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
@@ -116,6 +116,8 @@ def evaluate_candidates(
                 started = []
             obs, rewards, dones, infos = env.step(actor.act(obs))
             tracker.add(rewards if original is None else original(), obs)
+            # Some VecEnvs give numbers
+            dones = np.asarray(dones, dtype=bool)
             finished = dones & tracker.active
             on_step(CandidateStep(obs, rewards, dones, infos, finished))
             if finished.any():

@@ -26,7 +26,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     env = cast(VecEnv, model.env)
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
-    with interruptible(), guard(env), frozen(model.get_vec_normalize_env()):
+    with interruptible(), guard(env), frozen(env):
         try:
             yield
         finally:

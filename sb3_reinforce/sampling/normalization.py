@@ -1,10 +1,24 @@
 """VecNormalize during a comparison: one scale for all candidates, and no observation lost."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import cast
 
+import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import (
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecExtractDictObs,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+    VecVideoRecorder,
+)
+
+KEEP_REWARDS = (VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage, VecVideoRecorder)
 
 
 class ObservationStatistics:
@@ -25,18 +39,42 @@ class ObservationStatistics:
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
 
+def normalizers(env: VecEnv | None) -> list[VecNormalize]:
+    """All VecNormalize of a stack of wrappers, the outermost first."""
+    found = []
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize):
+            found.append(env)
+        env = env.venv
+    return found
+
+
+def original_reward_of(env: VecEnv) -> Callable[[], np.ndarray] | None:
+    """The method for the rewards below VecNormalize; None without one, or where a wrapper above it may change them."""
+    found = None
+    while isinstance(env, VecNormalize) or type(env) in KEEP_REWARDS:
+        if isinstance(env, VecNormalize) and env.norm_reward:
+            found = env.get_original_reward
+        env = cast(VecEnvWrapper, env).venv
+    return found
+
+
 @contextmanager
-def frozen(vec_normalize: VecNormalize | None) -> Iterator[ObservationStatistics | None]:
-    """Freeze a VecNormalize that is learning; after the block it learns what was observed, unless an error ended it."""
-    if vec_normalize is None or not vec_normalize.training:
-        yield None
-        return
-    observed = ObservationStatistics(vec_normalize)
-    vec_normalize.training = False
+def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
+    """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""
+    observed = [ObservationStatistics(each) for each in normalizers(env) if each.training]
+    set_training(observed, False)
     try:
         yield observed
     finally:
-        vec_normalize.training = True
-    for key, seen in observed.seen.items():
-        if seen.count:
-            observed.totals[key].combine(seen)
+        set_training(observed, True)
+    for each in observed:
+        for key, seen in each.seen.items():
+            if seen.count:
+                each.totals[key].combine(seen)
+
+
+def set_training(observed: list[ObservationStatistics], is_training: bool) -> None:
+    """Let each VecNormalize learn, or not."""
+    for each in observed:
+        each.vec_normalize.training = is_training

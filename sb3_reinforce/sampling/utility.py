@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
-from sb3_reinforce.sampling.normalization import ObservationStatistics
+from sb3_reinforce.sampling.normalization import ObservationStatistics, set_training
 
 
 class Stopped(Exception):
@@ -23,13 +23,13 @@ class EpisodicUtility:
     """
     U(θ) = E[Σ_t r_t] by the episodes of one update of a FiniteDifference, whose seeds begin with ``first_seed``.
 
-    It keeps all candidates and their values; ``observed`` is None unless a VecNormalize is frozen meanwhile.
+    It keeps all candidates and their values; ``observed`` has the statistics of each frozen VecNormalize.
     """
 
     model: Any
     searched: Sequence[th.nn.Parameter]
     callback: BaseCallback
-    observed: ObservationStatistics | None
+    observed: list[ObservationStatistics]
     first_seed: int
     candidates: list[th.Tensor] = field(default_factory=list)
     values: list[th.Tensor] = field(default_factory=list)
@@ -73,13 +73,11 @@ class EpisodicUtility:
             finished = np.flatnonzero(step.finished)
             self.model._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
         self.callback.update_locals({"self": self.model, **vars(step)})
-        if self.observed is None:
-            go_on = self.callback.on_step()
-        else:
-            self.observed.update()
-            # A callback may save the wrapper, and must find it as the user has set it
-            self.observed.vec_normalize.training = True
-            go_on = self.callback.on_step()
-            self.observed.vec_normalize.training = False
+        for each in self.observed:
+            each.update()
+        # A callback may save a wrapper, and must find it as the user has set it
+        set_training(self.observed, True)
+        go_on = self.callback.on_step()
+        set_training(self.observed, False)
         if not go_on:
             raise Stopped

@@ -277,7 +277,7 @@ def test_the_rule_of_thumb():
 
 def test_perturbations_are_one_percent_of_theta_or_a_twentieth():
     assert default_delta_std(th.full((4,), 10.0)) == pytest.approx(0.2) and default_delta_std(th.zeros(4)) == 0.05
-    assert make().learn(1).logger.name_to_value["train/delta_std"] == 0.05
+    assert make().learn(1, log_interval=None).logger.name_to_value["train/delta_std"] == 0.05
 
 
 def test_a_perturbation_and_an_estimator_of_the_user():

@@ -3,6 +3,7 @@
 from inspect import signature
 from itertools import product
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -381,3 +382,19 @@ def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout
     whole = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=15, learning_rate=0.0, seed=0, device="cpu").learn(30)
     th.testing.assert_close(model._next_state[:, 0], whole._next_state[:, 0])
     assert model.learn(10, reset_num_timesteps=False).num_timesteps == 40
+
+
+def test_a_trained_model_can_be_pickled():
+    model = make_recurrent(env=make_vec_env("CartPole-v1", 2), double=False, n_steps=8).learn(32)
+    copy = cloudpickle.loads(cloudpickle.dumps(model))
+    assert np.array_equal(copy._next_state, model._next_state)
+
+
+def test_one_environment_alone_needs_no_arrays_of_flags():
+    """As with RecurrentPPO."""
+    model = make_recurrent(env="CartPole-v1", double=False)
+    obs = np.ones(4, dtype=np.float32)
+    _, state = model.predict(obs)
+    expected = model.predict(obs, state, np.array([True]), deterministic=True)
+    for flag, given in ((True, state), ([True], list(state)), (np.ones((1, 1)), state)):
+        np.testing.assert_equal(model.predict(obs, given, flag, deterministic=True), expected)

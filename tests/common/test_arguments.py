@@ -314,6 +314,8 @@ def test_load_replaces_arguments_of_a_subclass_and_those_that_were_not_saved(kin
     Own("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model", exclude=["max_grad_norm"])
     loaded = Own.load(tmp_path / "model", max_grad_norm=0.1, own=2, device="cpu")
     assert type(loaded) is Own and (loaded.max_grad_norm, loaded.own) == (0.1, 2)
+    loaded.save(tmp_path / "model", exclude=["own"])
+    assert Own.load(tmp_path / "model", own=3, device="cpu").own == 3
     with pytest.raises(TypeError, match="gama"):
         Own.load(tmp_path / "model", gama=0.9)
 
@@ -408,3 +410,31 @@ def test_a_policy_goes_with_its_observations(kind):
         make(kind, Corridor(), "MultiInputPolicy")
     with pytest.raises(ValueError, match="MultiInputPolicy"):
         make(kind, Random(spaces.Dict(a=spaces.Box(0, 1))))
+
+
+def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
+    def loaded(n_envs, **kwargs):
+        return REINFORCE.load(tmp_path / "model", make_vec_env("CartPole-v1", n_envs), device="cpu", **kwargs)
+
+    REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 2), device="cpu").save(tmp_path / "model")
+    assert (loaded(2).n_steps, loaded(2).n_episodes) == (32, None)
+    other = loaded(20, baseline="leave_one_out")
+    assert (other.n_steps, other.n_episodes) == (None, 20)
+    assert (loaded(2, n_episodes=4).n_steps, loaded(2, n_episodes=4).n_episodes) == (None, 4)
+    make("steps", n_steps=32).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both given"):
+        loaded(1, n_episodes=4)
+    make("search", n_delta=None).save(tmp_path / "model")
+    n_deltas = [
+        FiniteDifference.load(tmp_path / "model", device="cpu", estimator=each).n_delta
+        for each in ("central", "regression")
+    ]
+    assert n_deltas[1] == 2 * n_deltas[0]
+
+
+@pytest.mark.parametrize("kind", ["steps", "episodes"])
+def test_without_gradients_nothing_is_learned_in_silence(kind):
+    model = make(kind)
+    with th.no_grad(), pytest.raises(ValueError, match="gradients"):
+        model.learn(16)
+    assert model.num_timesteps == 0

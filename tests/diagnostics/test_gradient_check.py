@@ -141,6 +141,12 @@ class HalfDetached(ActorCriticPolicy):
         return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
 
 
+def test_a_new_policy_whose_last_layer_alone_learns_is_named():
+    """The last layer's weights are small, and the scores of the others with them."""
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    assert check_gradient(REINFORCE(HalfDetached, env, device="cpu", seed=0)).failures == ["scores"]
+
+
 class WrongReturns(REINFORCE):
     """Forgets the discount factor of what is still to come."""
 

@@ -197,6 +197,8 @@ def test_curves_of_a_single_run_are_refused():
             plots.plot_learning_curves({"a": wrong}, np.arange(8))
         with pytest.raises(ValueError, match=r"curves\['a'\]"):
             plots.plot_variances({"a": wrong}, np.arange(1, 9))
+    with pytest.raises(ValueError, match="confidence must be below 1"):
+        plots.plot_variances({"a": np.ones((3, 8))}, np.arange(1, 9), confidence=1)
 
 
 def test_baselines_without_variance_are_drawn(tmp_path):

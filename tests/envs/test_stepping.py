@@ -1,4 +1,4 @@
-"""While a model learns, a DummyVecEnv returns what its own ``step`` returns, without its deep copies."""
+"""While a model learns, a DummyVecEnv returns what its own ``step`` returns."""
 
 from copy import deepcopy
 
@@ -26,7 +26,11 @@ class Drawn(gym.Env):
 
     def __init__(self, space, reuse=False):
         self.observation_space, self.action_space = deepcopy(SPACES[space]), spaces.Box(-1, 1, (2,))
-        self.reuse, self.info, self.array = reuse, {"steps": 0}, self.observation_space.sample()
+        self.reuse, self.info, self.array = (
+            reuse,
+            {"steps": 0, "position": np.zeros(2)},
+            self.observation_space.sample(),
+        )
 
     def observe(self):
         obs = self.observation_space.sample()
@@ -44,7 +48,8 @@ class Drawn(gym.Env):
     def step(self, action):
         self.info["steps"] += 1
         terminated, truncated = (self.np_random.random(2) < 0.3).tolist()
-        info = self.info if self.reuse else dict(self.info)
+        self.info["position"][:] = self.info["steps"]
+        info = self.info if self.reuse else deepcopy(self.info)
         return self.observe(), float(action.sum()), terminated, truncated, info
 
 
@@ -75,7 +80,7 @@ def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
         # What a callback may look at
         for name in ("actions", "buf_rews", "buf_dones"):
             assert_same(getattr(ours, name), getattr(theirs, name))
-        assert ours.buf_infos == returned[-1][0][3]
+        np.testing.assert_equal(ours.buf_infos, returned[-1][0][3])
     for (*arrays, infos), (*their_arrays, their_infos) in returned:
         for mine, other in zip(arrays, their_arrays, strict=True):
             assert_same(mine, other)

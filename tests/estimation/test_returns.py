@@ -46,7 +46,8 @@ def test_reward_to_go_and_lambda_return_at_one_are_the_double_sum(rollout, gamma
     expected = double_sum(rewards, dones, gamma, next_values)
     np.testing.assert_allclose(lambda_return(rewards, dones, next_values, gamma, 1.0), expected, atol=1e-12)
     expected = double_sum(rewards, dones, gamma, np.zeros_like(rewards))
-    np.testing.assert_allclose(reward_to_go(rewards, dones, gamma), expected, atol=1e-12)
+    for kind in (bool, int, np.float32):
+        np.testing.assert_allclose(reward_to_go(rewards, dones.astype(kind), gamma), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("gae_lambda", [0.0, 0.9, 1.0])

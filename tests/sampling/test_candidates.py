@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import (
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.starts import start_episodes
@@ -223,3 +223,45 @@ def test_an_episode_that_does_not_end_is_named(seeded):
     with pytest.raises(ValueError, match="An episode has not ended after max_episode_steps=8 steps"):
         evaluate(env, [2, 3, 9], seeds, max_episode_steps=8)
     evaluate(env, [2, 3, 9], seeds, max_episode_steps=9)
+
+
+class Shifted(VecEnvWrapper):
+    """Changes rewards."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return obs, rewards - 2.0, dones, infos
+
+
+class NumericEnds(VecEnvWrapper):
+    """Says in numbers which episodes end, as some VecEnvs do."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return obs, rewards, dones.astype(np.float32), infos
+
+
+def halved(env):
+    """A VecNormalize that makes 0.5 of a reward of 1."""
+    return VecNormalize(env, training=False, norm_obs=False, clip_reward=0.5)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "expected"),
+    [
+        (lambda env: NumericEnds(env), 1.0),
+        (lambda env: Shifted(env), -1.0),
+        (lambda env: VecFrameStack(halved(Shifted(env)), 2), -1.0),
+        (lambda env: halved(halved(Shifted(env))), -1.0),
+        (lambda env: Shifted(halved(env)), -1.5),
+    ],
+)
+def test_the_rewards_are_those_below_vec_normalize_and_above_other_wrappers(wrap, expected):
+    """One step of reward 1: a wrapper above VecNormalize has changed what it has scaled."""
+    assert evaluate(wrap(make_vec_env(Counting, 1)), [1])[0][0, 0] == pytest.approx(expected)

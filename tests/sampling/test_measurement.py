@@ -42,6 +42,19 @@ def test_the_policy_stays_as_it_was_and_the_observation_is_the_environments(kind
     assert plain(model.policy.state_dict()) != before
 
 
+@all_kinds
+def test_each_vec_normalize_of_a_stack_keeps_its_statistics(kind):
+    inner = VecNormalize(make_vec_env("CartPole-v1", 2), norm_reward=False)
+    model = make(kind, VecNormalize(inner, norm_obs=False)).learn(20)
+    count = inner.obs_rms.count
+    landscape(model, n_points=2, n_episodes=1)
+    assert inner.obs_rms.count == count and inner.training
+    n_steps = model.num_timesteps
+    model.learn(20, reset_num_timesteps=False)
+    # With the reset that follows a measurement
+    assert inner.obs_rms.count - count >= model.num_timesteps - n_steps
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
 def test_whatever_ends_a_measurement_the_next_rollout_begins_with_a_reset(error):
     """In the middle of training too, where a callback measures."""
