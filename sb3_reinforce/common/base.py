@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
@@ -54,6 +55,8 @@ class BasePolicyGradient(Distributed):
         self._check_policy(policy)
         if needs_env or env is not None:
             env = check_env(env, verbose)
+            if kwargs.get("use_sde") and not isinstance(env.action_space, spaces.Box):
+                raise ValueError(f"use_sde=True is for Box action spaces, not for {env.action_space}")
         # A copy: Stable-Baselines3 writes to it
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}

@@ -64,7 +64,7 @@ class Experiment(exp_manager.ExperimentManager):
     def __init__(self, *arguments: Any, **kwargs: Any):
         super().__init__(*arguments, **kwargs)
         self.model_config: Path | None = None
-        self.argument_names = allowed_keys(self.algo)
+        self.argument_names = allowed_keys(self.algo) | ZOO_ARGUMENTS
         if kwargs.get("config") is None:
             self.config = str(HYPERPARAMS / f"{self.algo}.yml")
             written = Path(self.trained_agent).parent / self.env_name / "config.yml"
@@ -99,7 +99,10 @@ class Experiment(exp_manager.ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)
-        keywords = {key: as_dict(key, found.get(key)) for key in ("policy_kwargs", "env_kwargs", TRAIN_ENV_KWARGS)}
+        keywords = {
+            key: as_dict(key, found.get(key))
+            for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", TRAIN_ENV_KWARGS)
+        }
         for names in keywords.values():
             self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))

@@ -154,7 +154,7 @@ RECURRENT, MASKABLE = (
         ("steps", {"env": "Pendulum-v1", "temperature": 0.5}, ["temperature", "Box"]),
         ("steps", {"env": "Pendulum-v1", "temperature": lambda progress: 1.0}, ["temperature", "Box"]),
         ("steps", {"target_kl": 0.01}, ["target_kl=0.01", "step='optimizer'", "'natural'"]),
-        ("steps", {"use_sde": True}, ["gSDE"]),
+        ("steps", {"use_sde": True}, ["use_sde=True", "Box", "Discrete"]),
         ("search", {"estimator": "regression", "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
         ("search", {"estimator": ESTIMATORS["regression"], "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
         ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),

@@ -185,6 +185,8 @@ SETTINGS = [
     ("env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
     ("train_env_kwargs: 3", "train_env_kwargs must be a dict, got 3"),
     ("train_env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
+    ("monitor_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
+    ("use_sde: true", "use_sde=True is for Box action spaces"),
     ("frame_stack: a", "frame_stack must be an integer, got 'a'"),
 ]
 
@@ -226,6 +228,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
         (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
+        ([*REINFORCE, "--device", "gpu9"], "device must be 'auto' or a device that PyTorch knows, got 'gpu9'"),
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
