@@ -13,16 +13,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import choose, forget_defaults
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import (
-    FINITE_DIFFERENCE_ARGUMENTS,
-    check_finite_difference,
-    check_learn,
-    choose,
-    forget_defaults,
-)
+from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,

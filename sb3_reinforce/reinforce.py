@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import forget_defaults
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -28,7 +29,6 @@ from sb3_reinforce.common.settings import (
     check_learn,
     check_reinforce,
     check_starts,
-    forget_defaults,
 )
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.envs.starts import has_given_seeds, start_episodes, start_groups
@@ -529,7 +529,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             model.gae_lambda = 1.0
         # A schedule that the copy renews is still to be renewed here
         model._schedules = dict(self._schedules)
-        model._chosen = {}
+        model._chosen_defaults = {}
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)

@@ -43,7 +43,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_reinforce import is_leader
-from sb3_reinforce.common.processes import Processes, place
+from sb3_reinforce.common.processes import Processes, rank_and_size
 from sb3_reinforce.zoo import ALGORITHMS as OURS
 from sb3_reinforce.zoo import HYPERPARAMS, Experiment
 
@@ -190,7 +190,7 @@ def main() -> None:
         if settings_of(algorithm, task)
     ]
     runs = sorted(set(wanted) - finished(arguments.output), key=wanted.index) if is_leader() else []
-    is_alone = place() == (0, 1)
+    is_alone = rank_and_size() == (0, 1)
     if not is_alone:
         with Processes() as processes:
             runs = processes.exchange(runs)[0]

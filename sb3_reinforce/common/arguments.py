@@ -128,3 +128,17 @@ def optional(check: Check) -> Check:
 def check_unless_none(name: str, value: Any, check: Check) -> Any:
     """Check a value that may also be None."""
     return None if value is None else check(name, value)
+
+
+def choose(model: Any, name: str, value: int) -> None:
+    """Set an argument that the user has left open."""
+    setattr(model, name, value)
+    model._chosen_defaults[name] = value
+
+
+def forget_defaults(model: Any) -> None:
+    """Leave open again what was chosen for a model that was saved: it may be loaded with others."""
+    for name, value in model._chosen_defaults.items():
+        if getattr(model, name) == value:
+            setattr(model, name, None)
+    model._chosen_defaults.clear()

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
@@ -17,7 +16,7 @@ from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device,
 from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
-from sb3_reinforce.common.spaces import check_env, shift_to_start
+from sb3_reinforce.common.spaces import check_env, check_noise, shift_to_start
 
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
@@ -55,13 +54,11 @@ class BasePolicyGradient(Distributed):
         self._check_policy(policy)
         if needs_env or env is not None:
             env = check_env(env, verbose)
-            if kwargs.get("use_sde") and not isinstance(env.action_space, spaces.Box):
-                raise ValueError(f"use_sde=True is for Box action spaces, not for {env.action_space}")
+            check_noise(kwargs.get("use_sde", False), env.action_space)
         # A copy: Stable-Baselines3 writes to it
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
-        # What was chosen for arguments that the user has left open
-        self._chosen: dict[str, int] = {}
+        self._chosen_defaults: dict[str, int] = {}
         super().__init__(env=env, **kwargs)
 
     def _check_policy(self, policy: str | type) -> None:
@@ -171,7 +168,6 @@ class BasePolicyGradient(Distributed):
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
                 "call set_parameters with this path and exact_match=False"
             )
-        # A subclass may have arguments of its own
         arguments = (cls._arguments.keys() | signature(cls).parameters.keys()) - ATTRIBUTES.keys()
         unknown = sorted(kwargs.keys() - arguments - saved - LOAD_ARGUMENTS)
         if unknown:

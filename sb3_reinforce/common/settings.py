@@ -23,6 +23,7 @@ from sb3_reinforce.common.arguments import (
     check_name,
     check_number,
     check_subclass,
+    choose,
     optional,
     unknown_name,
 )
@@ -187,20 +188,6 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")
     elif model.min_std > 0:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
-
-
-def choose(model: Any, name: str, value: int) -> None:
-    """Set an argument that the user has left open."""
-    setattr(model, name, value)
-    model._chosen[name] = value
-
-
-def forget_defaults(model: Any) -> None:
-    """Leave open again what was chosen for a model that was saved: it may be loaded with others."""
-    for name, value in model._chosen.items():
-        if getattr(model, name) == value:
-            setattr(model, name, None)
-    model._chosen.clear()
 
 
 def check_named(name: str, value: Any, functions: Functions) -> Any:

@@ -79,3 +79,9 @@ def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
     """Turn stored actions ``(n, action_dim)`` into what ``evaluate_actions`` takes: int64 ``(n,)`` for Discrete."""
     return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions.float()
+
+
+def check_noise(use_sde: bool, action_space: spaces.Space[Any]) -> None:
+    """Check that gSDE, the noise of a Gaussian policy, goes with the actions."""
+    if use_sde and not isinstance(action_space, spaces.Box):
+        raise ValueError(f"use_sde=True is for Box action spaces, not for {action_space}")
