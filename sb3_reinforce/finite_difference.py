@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import choose, forget_defaults
+from sb3_reinforce.common.arguments import choose
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -60,7 +60,8 @@ class FiniteDifference(BasePolicyGradient):
     of one VecEnv, in one batched forward pass.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
-    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it.
+    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it, but of the
+    scaled ones where a wrapper above it may change rewards (one that Stable-Baselines3 does not have).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -161,7 +162,6 @@ class FiniteDifference(BasePolicyGradient):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        forget_defaults(self)
         check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)
@@ -181,6 +181,7 @@ class FiniteDifference(BasePolicyGradient):
         n_parameters = self.n_parameters
         if self.n_delta is None:
             choose(self, "n_delta", default_n_delta(self.estimator, n_parameters))
+            check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""

@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import forget_defaults
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -252,7 +251,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return self._scheduled("critic_learning_rate")
 
     def _setup_model(self) -> None:
-        forget_defaults(self)
         check_reinforce(self, BASELINES)
         # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout resizes it
         n_steps = self.n_steps
@@ -529,7 +527,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             model.gae_lambda = 1.0
         # A schedule that the copy renews is still to be renewed here
         model._schedules = dict(self._schedules)
-        model._chosen_defaults = {}
         model._processes = None
         model.set_logger(Logger(folder=None, output_formats=[]))
         model.ep_info_buffer = deque(maxlen=1)

@@ -4,6 +4,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from inspect import signature
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
@@ -136,9 +137,9 @@ def choose(model: Any, name: str, value: int) -> None:
     model._chosen_defaults[name] = value
 
 
-def forget_defaults(model: Any) -> None:
-    """Leave open again what was chosen for a model that was saved: it may be loaded with others."""
-    for name, value in model._chosen_defaults.items():
-        if getattr(model, name) == value:
-            setattr(model, name, None)
-    model._chosen_defaults.clear()
+def own_arguments(cls: type, base: type) -> set[str]:
+    """The arguments of a class and of what it extends below ``base``, but for the environment and private ones."""
+    classes = cls.__mro__[: cls.__mro__.index(base)]
+    arguments = [each for one in classes for each in signature(one.__init__).parameters.values()]  # type: ignore[misc]
+    named = {each.name for each in arguments if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+    return {name for name in named - {"self", "env"} if not name.startswith("_")}

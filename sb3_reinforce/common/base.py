@@ -12,7 +12,14 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common import storage
-from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device, check_flag, check_function
+from sb3_reinforce.common.arguments import (
+    Check,
+    CheckedSchedule,
+    check_device,
+    check_flag,
+    check_function,
+    own_arguments,
+)
 from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
@@ -22,8 +29,6 @@ Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
 LOAD_ARGUMENTS = {"custom_objects", "print_system_info", "force_reset"}
-# The names in REINFORCE's parameters; FiniteDifference lacks the last
-STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 
 
 class BasePolicyGradient(Distributed):
@@ -40,8 +45,9 @@ class BasePolicyGradient(Distributed):
     def __new__(cls: type[Model], *args: Any, **kwargs: Any) -> Model:
         # Where Python would only say that an argument is unexpected; a subclass may have it
         accepted = {name for each in cls.__mro__ for name in signature(each.__init__).parameters}  # type: ignore[misc]
-        for name in kwargs.keys() & cls._instead.keys() - accepted:
-            raise TypeError(f"{cls.__name__} has no argument {name}: {cls._instead[name]}")
+        for name, instead in cls._instead.items():
+            if name in kwargs and name not in accepted:
+                raise TypeError(f"{cls.__name__} has no argument {name}: {instead}")
         return super().__new__(cls)
 
     def __init__(self, policy: Any, env: Any, *, needs_env: bool, policy_kwargs: Any, verbose: int, **kwargs: Any):
@@ -155,7 +161,8 @@ class BasePolicyGradient(Distributed):
             not been interrupted, from a reset of the environments on; the file has neither the environments' state and
             generators nor the statistics of VecNormalize. Without it, a model with a seed seeds the generators again:
             to seed them otherwise, do so after loading
-        :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones
+        :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones. An
+            ``lr_schedule`` that was set by hand is not stored
         :return: The model
         :raises TypeError: If an argument is of the wrong type, or the algorithm has none of this name
         :raises ValueError: If an argument is out of its range, or the file is damaged or has no random state
@@ -168,8 +175,8 @@ class BasePolicyGradient(Distributed):
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
                 "call set_parameters with this path and exact_match=False"
             )
-        arguments = (cls._arguments.keys() | signature(cls).parameters.keys()) - ATTRIBUTES.keys()
-        unknown = sorted(kwargs.keys() - arguments - saved - LOAD_ARGUMENTS)
+        arguments = own_arguments(cls, BasePolicyGradient) - ATTRIBUTES.keys()
+        unknown = sorted(kwargs.keys() - arguments - saved.keys() - LOAD_ARGUMENTS)
         if unknown:
             raise TypeError(
                 f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {', '.join(sorted(arguments))}"
@@ -178,6 +185,7 @@ class BasePolicyGradient(Distributed):
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         if env is not None:
             env = check_env(env, verbose=0)
+        kwargs = storage.leave_open(saved, kwargs, None if env is None else getattr(env, "num_envs", 1))
         model = super().load(path, env, device, *args, **kwargs)
         if restore_random_state:
             storage.restore_generators(model._random_state, model.device)
@@ -226,17 +234,7 @@ class BasePolicyGradient(Distributed):
         if not isinstance(states, dict):
             storage.check_archive(states, ("policy.pth",))
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
-        names = self._get_torch_save_params()[0]
-        allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
-        own: dict[str, Any] = {name: states[name] for name in names if name in states}
-        if not states.keys() <= allowed or not own or (exact_match and len(own) < len(names)):
-            raise ValueError(
-                f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing "
-                f"else, got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
-            )
-        for name, state in own.items():
-            if not isinstance(state, Mapping):
-                raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
+        own = storage.check_states(states, self._get_torch_save_params()[0], exact_match)
         # A mask that a user's policy adds to its logits may well be infinite
         storage.check_finite_state(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
         before: Any = deepcopy(self.get_parameters())

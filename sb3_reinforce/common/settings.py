@@ -28,6 +28,7 @@ from sb3_reinforce.common.arguments import (
     unknown_name,
 )
 from sb3_reinforce.common.processes import rank_and_size
+from sb3_reinforce.common.spaces import check_noise
 
 Functions = Mapping[str, Callable[..., Any]]
 
@@ -163,6 +164,7 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model, REINFORCE_ARGUMENTS)
     model.baseline = check_named("baseline", model.baseline, baselines)
+    check_noise(model.use_sde, model.action_space)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
             choose(model, "n_steps", 32)
@@ -226,7 +228,7 @@ def check_finite_difference(model: Any, estimators: Functions, perturbations: Fu
         raise ValueError("n_delta must be at least 2 with estimator='regression', which fits an intercept too, got 1")
     if model.n_top is not None and model.estimator != "central":
         raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
-    if model.n_top is not None and (model.n_delta is None or model.n_top > model.n_delta):
+    if model.n_top is not None and model.n_delta is not None and model.n_top > model.n_delta:
         raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
 
 

@@ -20,6 +20,8 @@ from stable_baselines3.common.save_util import open_path
 from sb3_reinforce.common.processes import is_leader
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
+# The names in REINFORCE's parameters; FiniteDifference lacks the last
+STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
 # Flags of optimizers, which PyTorch fills in where the state of another version of it lacks them
 FLAGS = ("decoupled_weight_decay", "foreach", "fused", "maximize", "capturable", "differentiable")
 
@@ -53,8 +55,8 @@ def write_whole(target: PathOrFile, content: bytes) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> set[str]:
-    """Check that a saved model has the needed parts and the right checksums, and return the names of its attributes."""
+def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]:
+    """Check that a saved model has the needed parts and the right checksums, and return its attributes as JSON."""
     file: Any = open_path(source, "r", suffix="zip")
     try:
         with zipfile.ZipFile(file) as archive:
@@ -62,7 +64,7 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> set[str]:
             damaged = archive.testzip()
             if damaged is not None:
                 raise zipfile.BadZipFile(f"the checksum of its part {damaged!r} is wrong")
-            attributes = set(json.loads(archive.read("data"))) if "data" in parts else set()
+            attributes: dict[str, Any] = json.loads(archive.read("data")) if "data" in parts else {}
     except Exception as error:
         # Bytes that have changed raise errors of many kinds
         raise ValueError(f"{source} is damaged, or not a saved model: {error}") from error
@@ -73,6 +75,29 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> set[str]:
     if missing:
         raise ValueError(f"{source} is not a saved model, or not a whole one: it has no {', '.join(missing)}")
     return attributes
+
+
+def leave_open(saved: Mapping[str, Any], given: dict[str, Any], n_envs: int | None) -> dict[str, Any]:
+    """``given``, and None for what was chosen for the user, where arguments are given or ``n_envs`` is another."""
+    if not given and n_envs in (None, saved["n_envs"]):
+        return given
+    chosen = saved.get("_chosen_defaults", {})
+    return {name: None for name, value in chosen.items() if saved[name] == value} | given
+
+
+def check_states(states: Mapping[str, Any], names: list[str], exact_match: bool) -> dict[str, Any]:
+    """Check that there is a state for all of ``names`` or, without ``exact_match``, for some, and return these."""
+    own = {name: states[name] for name in names if name in states}
+    allowed = {*names} if exact_match else {*names, *STATES_OF_BOTH}
+    if not states.keys() <= allowed or not own or (exact_match and len(own) < len(names)):
+        raise ValueError(
+            f"load_path_or_dict must have {'all' if exact_match else 'some'} of {', '.join(names)} and nothing else, "
+            f"got {', '.join(map(str, states))}: exact_match=False takes {{'policy': ...}} alone too"
+        )
+    for name, state in own.items():
+        if not isinstance(state, Mapping):
+            raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
+    return own
 
 
 def check_finite_state(state: Any, infinite: set[str], name: str = "") -> None:

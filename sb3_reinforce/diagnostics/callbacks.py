@@ -225,7 +225,7 @@ class PitfallCallback(Diagnosis):
         logged = self.logger.name_to_value
         returns = rollout.returns[rollout.used]
         return Update(
-            kl=logged.get("train/kl", 0.0),
+            kl=logged.get("train/kl", math.nan),
             randomness=randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan)),
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),

@@ -25,7 +25,7 @@ from sb3_reinforce.reinforce import REINFORCE
 class Update:
     """What is known of one update; NaN for what is not known."""
 
-    kl: float  # mean of log π_old − log π_new over steps of the rollout, at its temperature
+    kl: float  # of the policy step, as logged
     randomness: float  # share of the randomness that the policy could have, from 0 to 1
     grad_norm: float  # before clipping
     explained_variance: float  # of the critic
@@ -71,7 +71,7 @@ def rate_too_large(history: History) -> str | None:
     within ten, which a falling temperature may explain.
     """
     updates = history.updates[-10:]
-    steps = [update.kl for update in updates]
+    steps = [update.kl for update in updates if not math.isnan(update.kl)]
     before = updates[0].randomness
     after = updates[-1].randomness
     if history.progress_remaining > 0.5 and before < 0.05:
@@ -79,7 +79,7 @@ def rate_too_large(history: History) -> str | None:
         return None
     argument, value = step_bound(history)
     remedy = f"Lower {argument} (now {value:.2g})"
-    if steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1):
+    if steps and (steps[-1] > 1 or (len(steps) == 10 and median(steps) > 0.1)):
         return (
             f"The policy changes too much per update: the KL divergence of the last one is {steps[-1]:.2g} (median of "
             f"the last {len(steps)}: {median(steps):.2g}; 0.01 is usual). {remedy}, or use a falling schedule"

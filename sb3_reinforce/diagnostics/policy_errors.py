@@ -61,24 +61,21 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
 
 def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
-    The larger ``difference_error`` of those at θ and at ``θ + W``, with W ~ N(0, 1/fan-in) for each weight.
+    ``difference_error`` at θ, or a fifth of it with the last layer's weights scaled to norm √n_out, if that is larger.
 
-    The last layer of a new policy has small weights, with which the scores of the others hardly count at θ.
+    The last layer of a new policy has small weights, with which the scores of the others hardly count at θ. With
+    larger weights log π is curved more.
     """
-    parameters = trainable(policy)
-    theta = to_vector(parameters)
-    noise = [
-        th.randn_like(each) / math.sqrt(each[0].numel()) if each.dim() > 1 else th.zeros_like(each)
-        for each in parameters
-    ]
     error = difference_error(policy, obs, actions)
-    write(parameters, theta + to_vector(noise))
+    layer = getattr(policy, "action_net", None)
+    if not isinstance(layer, th.nn.Linear):
+        return error
+    before = layer.weight.detach().clone()
+    write([layer.weight], (before * max(1.0, len(before) ** 0.5 / float(before.norm().clamp(min=1e-6)))).flatten())
     try:
-        shaken = difference_error(policy, obs, actions)
+        return max(error, difference_error(policy, obs, actions) / 5)
     finally:
-        write(parameters, theta)
-    # log π need not be finite there
-    return max(error, shaken) if math.isfinite(shaken) else error
+        write([layer.weight], before.flatten())
 
 
 def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:

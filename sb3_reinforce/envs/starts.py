@@ -28,8 +28,8 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
         except NotImplementedError as error:
             raise ValueError(
                 "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
-                f"{type(env.unwrapped).__name__} does not have here: use another VecEnv. Training does without it with "
-                "common_random_numbers=False and episodes_per_start=1"
+                f"{type(env.unwrapped).__name__} does not have here: use another VecEnv. FiniteDifference trains "
+                "without it with common_random_numbers=False, and REINFORCE with episodes_per_start=1"
             ) from error
     return env.reset()
 

@@ -19,6 +19,8 @@ from stable_baselines3.common.vec_env import (
 )
 
 KEEP_REWARDS = (VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage, VecVideoRecorder)
+# A subclass may have another one
+METHODS = [wrapper.step_wait for wrapper in KEEP_REWARDS]
 
 
 class ObservationStatistics:
@@ -52,7 +54,7 @@ def normalizers(env: VecEnv | None) -> list[VecNormalize]:
 def original_reward_of(env: VecEnv) -> Callable[[], np.ndarray] | None:
     """The method for the rewards below VecNormalize; None without one, or where a wrapper above it may change them."""
     found = None
-    while isinstance(env, VecNormalize) or type(env) in KEEP_REWARDS:
+    while isinstance(env, VecNormalize) or (isinstance(env, KEEP_REWARDS) and type(env).step_wait in METHODS):
         if isinstance(env, VecNormalize) and env.norm_reward:
             found = env.get_original_reward
         env = cast(VecEnvWrapper, env).venv

@@ -141,6 +141,16 @@ class HalfDetached(ActorCriticPolicy):
         return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_memory_that_larger_weights_would_make_explode_passes(seed):
+    pytest.importorskip("sb3_contrib")
+    from sb3_reinforce.recurrent import RecurrentREINFORCE
+
+    memory = {"memory": "rnn", "lstm_hidden_size": 64, "lstm_kwargs": {"nonlinearity": "relu"}}
+    model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=seed)
+    assert check_gradient(model).passed
+
+
 def test_a_new_policy_whose_last_layer_alone_learns_is_named():
     """The last layer's weights are small, and the scores of the others with them."""
     env = make_vec_env("CartPole-v1", 2, seed=0)

@@ -15,7 +15,14 @@ from stable_baselines3.common.policies import (
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.starts import start_episodes
@@ -236,6 +243,10 @@ class Shifted(VecEnvWrapper):
         return obs, rewards - 2.0, dones, infos
 
 
+class Monitored(VecMonitor):
+    """A subclass with the steps of a wrapper that leaves rewards alone."""
+
+
 class NumericEnds(VecEnvWrapper):
     """Says in numbers which episodes end, as some VecEnvs do."""
 
@@ -260,8 +271,9 @@ def halved(env):
         (lambda env: VecFrameStack(halved(Shifted(env)), 2), -1.0),
         (lambda env: halved(halved(Shifted(env))), -1.0),
         (lambda env: Shifted(halved(env)), -1.5),
+        (lambda env: Monitored(halved(Shifted(env))), -1.0),
     ],
 )
 def test_the_rewards_are_those_below_vec_normalize_and_above_other_wrappers(wrap, expected):
     """One step of reward 1: a wrapper above VecNormalize has changed what it has scaled."""
-    assert evaluate(wrap(make_vec_env(Counting, 1)), [1])[0][0, 0] == pytest.approx(expected)
+    assert evaluate(wrap(DummyVecEnv([Counting])), [1])[0][0, 0] == pytest.approx(expected)
