@@ -79,10 +79,10 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
 
 def leave_open(saved: Mapping[str, Any], given: dict[str, Any], n_envs: int | None) -> dict[str, Any]:
     """``given``, and None for what was chosen for the user, where arguments are given or ``n_envs`` is another."""
-    if not given and n_envs in (None, saved["n_envs"]):
+    if not given and n_envs in (None, saved.get("n_envs")):
         return given
     chosen = saved.get("_chosen_defaults", {})
-    return {name: None for name, value in chosen.items() if saved[name] == value} | given
+    return {name: None for name, value in chosen.items() if saved.get(name) == value} | given
 
 
 def check_states(states: Mapping[str, Any], names: list[str], exact_match: bool) -> dict[str, Any]:
