@@ -249,10 +249,29 @@ class Scaled(ActorCriticPolicy):
         return super().get_distribution(obs / 5)
 
 
-def test_a_policy_with_another_distribution_is_refused():
-    model = REINFORCE(Scaled, "CartPole-v1", step="natural", n_steps=32, seed=0)
+class Rescaled(ActorCriticPolicy):
+    """Learns from a parameter that ``get_distribution`` does not have."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.scale = th.nn.Parameter(th.ones(()))
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob * self.scale, entropy
+
+
+@pytest.mark.parametrize(
+    ("policy", "sentence"),
+    [
+        (Scaled, "get_distribution of Scaled does not give the log π"),
+        (Rescaled, "get_distribution does not depend on all"),
+    ],
+)
+def test_a_policy_with_another_distribution_is_refused(policy, sentence):
+    model = REINFORCE(policy, "CartPole-v1", step="natural", n_steps=32, seed=0)
     before = to_vector(model.policy.parameters())
-    with pytest.raises(ValueError, match="get_distribution of Scaled does not give the log π"):
+    with pytest.raises(ValueError, match=sentence):
         model.learn(32)
     assert th.equal(to_vector(model.policy.parameters()), before)
 
@@ -374,23 +393,3 @@ def test_an_estimate_takes_different_steps(n, expected):
     obs, actions = some_steps(policy, {"numbers": th.arange(n)}, th.arange(n))
     assert len(actions.unique()) == len(actions) == expected
     assert th.equal(obs["numbers"], actions)
-
-
-class Rescaled(ActorCriticPolicy):
-    """Learns from a parameter that ``get_distribution`` does not have."""
-
-    def _build(self, lr_schedule):
-        super()._build(lr_schedule)
-        self.scale = th.nn.Parameter(th.ones(()))
-
-    def evaluate_actions(self, obs, actions):
-        values, log_prob, entropy = super().evaluate_actions(obs, actions)
-        return values, log_prob * self.scale, entropy
-
-
-def test_a_policy_whose_distribution_lacks_a_parameter_is_refused():
-    model = REINFORCE(Rescaled, "CartPole-v1", step="natural", n_steps=32, seed=0)
-    before = to_vector(model.policy.parameters())
-    with pytest.raises(ValueError, match="get_distribution does not depend on all"):
-        model.learn(32)
-    assert th.equal(to_vector(model.policy.parameters()), before)
