@@ -12,12 +12,12 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies.evaluation import actor_parameters, log_prob_of
-from sb3_reinforce.policies.sequences import RecurrentPolicy
 
 
 def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     """The trainable parameters that log π depends on, in the policy's order, without ``log_std``."""
-    if isinstance(policy, RecurrentPolicy):
+    # The memory of this package's recurrent policies and of sb3-contrib's
+    if hasattr(policy, "lstm_actor"):
         raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
     zero_obs: Any = create_empty_array(policy.observation_space)
     obs = obs_as_tensor(zero_obs, policy.device)

@@ -14,6 +14,7 @@ from environments import Corridor, Random, Reused
 from gymnasium import spaces
 from models import plain
 from recurrent_models import SPACES, by_steps, make_recurrent
+from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
@@ -325,6 +326,10 @@ def observing(space):
         (observing(spaces.MultiDiscrete([2, 3])), "observation_space must have no MultiDiscrete"),
         (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "MultiDiscrete part, .* as a Box, got Dict"),
         (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
+        (
+            lambda env: landscape(RecurrentPPO("MlpLstmPolicy", env, device="cpu")),
+            "must have no memory, got RecurrentActorCriticPolicy",
+        ),
         (memory(memory="LSTM"), "memory must be one of 'lstm', 'gru', 'rnn'"),
         (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
         (

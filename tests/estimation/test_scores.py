@@ -114,6 +114,11 @@ def test_a_policy_without_a_gradient_is_named():
         gradients_by_episode(replace(rollout, policy=detached), rollout.returns)
 
 
+def test_missing_weights_are_named():
+    with pytest.raises(ValueError, match="weights must hold at least one tensor"):
+        gradients_by_episode(collect(Corridor((2, 9))))
+
+
 @pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "action_net.bias", "log_std"])
 def test_frozen_parameters_have_no_gradient(frozen):
     rollout = collect(Corridor((2, 9), action_space=BOX))
