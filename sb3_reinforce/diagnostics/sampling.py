@@ -19,7 +19,7 @@ from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import undisturbed
 
 
-def sample(model: REINFORCE, n_episodes: int, progress_bar: bool = False) -> Rollout:
+def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progress_bar: bool = False) -> Rollout:
     """
     Whole episodes of the model's policy in its environments, with the model's own returns.
 
@@ -30,13 +30,14 @@ def sample(model: REINFORCE, n_episodes: int, progress_bar: bool = False) -> Rol
 
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
+    :param baseline: The baseline to collect with; None for ``"value"`` if the model has a critic, else ``"none"``
     :param progress_bar: Display a bar of tqdm that counts the episodes
-    :return: The rollout; it has ``values`` only if the model has a critic
+    :return: The rollout; it has ``values`` only if the baseline is ``"value"``
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     check_model(model)
-    collector = model.sampling_copy(check_integer("n_episodes", n_episodes, 2))
+    collector = model.sampling_copy(check_integer("n_episodes", n_episodes, 2), baseline)
     with undisturbed(model), episode_bar(progress_bar, n_episodes) as bar:
         return collect_episodes(collector, bar)
 

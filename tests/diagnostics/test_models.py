@@ -24,7 +24,6 @@ from sb3_reinforce.diagnostics import (
     landscape,
     sample,
 )
-from sb3_reinforce.diagnostics.sampling import collect_episodes
 
 
 def lab():
@@ -157,9 +156,9 @@ def test_other_models_are_refused(measure):
 
 
 def test_a_sample_without_values_has_monte_carlo_returns():
-    """λ weights values, and a measurement without the critic has none."""
+    """λ weights values, and a sample with another baseline has none."""
     model = REINFORCE("MlpPolicy", Corridor((5,)), gae_lambda=0.5, gamma=1.0, device="cpu")
-    assert collect_episodes(model.sampling_copy(2, "none")).returns[:5, 0].tolist() == [5, 4, 3, 2, 1]
+    assert sample(model, 2, baseline="none").returns[:5, 0].tolist() == [5, 4, 3, 2, 1]
 
 
 def test_a_landscape_needs_an_actor_critic_policy():
