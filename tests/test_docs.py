@@ -32,7 +32,7 @@ BUDGETS = {
     "record_video": "-n 20",
     "scaling.py": "--n-envs 64 --timesteps 64 --rounds 1",
     "search_throughput.py": "--n-envs 2 --n-delta 2 --updates 1 --rounds 1",
-    "search_vs_ars.py": "--env CartPole-v1 --seeds 0 --timesteps 100 --results rows.csv",
+    "search_vs_ars.py": "--env CartPole-v1 --seeds 0 --timesteps 100 --output rows.csv",
     "throughput.py": "--n-envs 64 --timesteps 64 --rounds 1",
     "train": "-n 200 --eval-freq -1",
     "variance_vs_episodes.py": "--timesteps 100 --batches 2 --output .",

@@ -205,7 +205,7 @@ def peers() -> str:
     for name, runs in rows.groupby("contender", sort=False):
         ratio = (rates["REINFORCE"] / rates[name]).median()
         lines.append([name, f"{ratio:.1f}", *(number(runs[column].median(), 0) for column in ("steps", "seconds"))])
-    return markdown(["", "REINFORCE's steps/s ÷ its own", "steps to the return", "CPU seconds"], lines)
+    return markdown(["", "REINFORCE's steps/s ÷ this one's", "steps to the return", "CPU seconds"], lines)
 
 
 def images() -> str:

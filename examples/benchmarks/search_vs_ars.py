@@ -1,10 +1,10 @@
 """
 Does FiniteDifference end as high as SB3-Contrib's ARS with the RL Zoo's settings, at the same number of real steps?
 
-    python examples/benchmarks/search_vs_ars.py --env Pendulum-v1 --seeds 20 21 22 23 24
+    python examples/benchmarks/search_vs_ars.py --env Pendulum-v1 --seeds 20 21 22 23 24 --output search.csv
 
 FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Each run ends with the mean return of 100 episodes of the
-final policy, and adds a line to results/search_vs_ars.csv.
+final policy, and adds a line to the CSV.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
-RESULTS = Path(__file__).parent / "results" / "search_vs_ars.csv"
+
 # As they are called in the results, and in rl_zoo3.ALGOS
 NAMES = {"FiniteDifference": "finite_difference", "ARS": "ars"}
 
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--algo", nargs="+", default=list(NAMES), choices=list(NAMES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[20, 21, 22, 23, 24])
     parser.add_argument("--timesteps", type=int, help="by default as many as the Zoo gives ARS")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--output", type=Path, required=True, help="the CSV; rows are added to it")
     arguments = parser.parse_args()
     needed = set(arguments.algo)
     if not arguments.timesteps:
@@ -75,8 +75,8 @@ def main() -> None:
             model.policy.load_state_dict(callback.policy)
             row = [arguments.env, name, seed, timesteps, callback.steps, round(mean_return(model, arguments.env), 1)]
             print(*row, "| after learn():", model.num_timesteps, round(after, 1), flush=True)
-            is_new = not arguments.results.exists()
-            with arguments.results.open("a", newline="") as file:
+            is_new = not arguments.output.exists()
+            with arguments.output.open("a", newline="") as file:
                 writer = csv.writer(file)
                 if is_new:
                     writer.writerow(["env", "algorithm", "seed", "budget", "steps", "mean_return"])
