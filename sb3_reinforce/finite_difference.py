@@ -75,14 +75,13 @@ class FiniteDifference(BasePolicyGradient):
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
     :param n_eval_episodes: Episodes behind each utility, which is their mean
-    :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the luck of
-        the start from differences, at the price of environments that idle until the longest episode of a round is over
+    :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of the start from differences, but environments idle until the longest episode of a round ends
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
     :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
         ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``
     :param deterministic: Whether candidates take their most likely actions, or sample
     :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
-    :param max_episode_steps: The length beyond which an episode counts as one that never ends
+    :param max_episode_steps: The length beyond which an episode raises an error
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to

@@ -114,7 +114,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         schedule that falls to 0 ends with an almost deterministic policy, which is how policies are evaluated
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor
-    :param max_episode_steps: With ``n_episodes``, the length beyond which an episode counts as one that never ends
+    :param max_episode_steps: With ``n_episodes``, the length beyond which an episode raises an error
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE) instead of action noise
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only before each rollout
     :param rollout_buffer_class: Rollout buffer class to use. Its arrays are written in place: ``add``, ``get`` and
