@@ -1,8 +1,8 @@
 # %% [markdown]
 # # What can go wrong, and how do you notice?
 #
-# `PitfallCallback` watches a training, changes nothing, and warns once about each of eight known pitfalls. In a
-# healthy run it is silent. Here are eight runs that each fall into one.
+# `PitfallCallback` watches a run, changes nothing, and warns once about each of eight known pitfalls. In a healthy run
+# it is silent. Here is a run for each pitfall.
 
 # %%
 import warnings
@@ -20,18 +20,19 @@ seed = 0
 th.set_num_threads(1)
 
 # %% [markdown]
-# The traps are tasks of a few steps, in which a function of the step and the action gives the reward.
+# The traps are tasks of a few steps, in which a function gives the reward.
 
 
 # %%
 class Task(gym.Env):
-    """Episodes of drawn lengths; the observation is the one-hot time step."""
+    """Episodes of random length; the observation is the one-hot time step."""
 
     action_space = spaces.Discrete(2)
 
-    def __init__(self, lengths, reward=lambda t, action: 1.0):
+    def __init__(self, lengths, reward=lambda env, action: 1.0):
         self.lengths, self.reward = lengths, reward
         self.observation_space = spaces.Box(0, 1, (max(lengths) + 1,))
+        self.n_steps = 0
 
     def observe(self):
         return np.eye(max(self.lengths) + 1, dtype=np.float32)[self.t]
@@ -42,33 +43,32 @@ class Task(gym.Env):
         return self.observe(), {}
 
     def step(self, action):
-        reward = self.reward(self.t, action)
+        self.n_steps += 1
+        reward = self.reward(self, action)
         self.t += 1
         return self.observe(), reward, self.t == self.length, False, {}
 
 
-def noise(t, action):
-    return float(np.random.normal())
+def huge(env, action):
+    return 5e3
 
 
-class Jackpot(Task):
-    """Pays a thousandfold, once, after 40 episodes."""
-
-    def __init__(self):
-        super().__init__((3,), self.pay)
-        self.n_paid = 0
-
-    def pay(self, t, action):
-        self.n_paid += 1
-        return 1000.0 if self.n_paid == 120 else 1.0
+def noisy(env, action):
+    """Little signal: the better action earns 0.1 more, and the later steps 1 more."""
+    return 0.1 * action + float(env.t > 1) + env.np_random.normal()
 
 
-def run(env, timesteps=2000, change=None, **arguments):
-    """Train, and return what the callback found, by name."""
+def jackpot(env, action):
+    """Pays a thousandfold once, after 40 episodes of three steps."""
+    return 1000.0 if env.n_steps == 40 * 3 else 1.0
+
+
+def run(env, timesteps, prepare=None, **arguments):
+    """Train, and return what the callback found, by name; ``prepare`` changes the policy first."""
     model = REINFORCE("MlpPolicy", make_vec_env(env, seed=seed), seed=seed, device="cpu", **arguments)
-    if change is not None:
+    if prepare is not None:
         with th.no_grad():
-            change(model.policy)
+            prepare(model.policy)
     callback = PitfallCallback()
     with warnings.catch_warnings():
         # They are printed below instead
@@ -77,32 +77,32 @@ def run(env, timesteps=2000, change=None, **arguments):
     return callback.found
 
 
+def wild_critic(policy):
+    policy.value_net.weight.mul_(20)
+
+
+def strong_preference(policy):
+    policy.action_net.bias.copy_(th.tensor([9.0, 0.0]))
+
+
 # %%
 one_episode = {"baseline": "none", "n_episodes": 1}
+total_return = {"baseline": "none", "n_episodes": 4, "reward_to_go": False}
 runs = {
     "rate_too_large": ("CartPole-v1", 2000, {"learning_rate": 1.0}),
-    "unscaled_returns": (lambda: Task((5,), lambda t, action: 5e3), 64, {}),
-    "too_few_episodes": (lambda: Task((4,), noise), 400, one_episode),
-    "total_return": (lambda: Task((4,)), 64, {"baseline": "none", "n_episodes": 4, "reward_to_go": False}),
-    "spikes_without_clipping": (Jackpot, 300, {**one_episode, "max_grad_norm": None}),
-    # A critic that starts with wild values and does not learn
-    "useless_critic": (
-        lambda: Task((4,), noise),
-        8000,
-        {"critic_learning_rate": 0.0, "change": lambda policy: policy.value_net.weight.mul_(20)},
-    ),
-    # A policy that starts with a strong preference
-    "deterministic_too_early": (
-        lambda: Task((4,)),
-        640,
-        {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([9.0, 0.0]))},
-    ),
+    "unscaled_returns": (lambda: Task((5,), huge), 64, {}),
+    "too_few_episodes": (lambda: Task((4,), noisy), 400, one_episode),
+    "total_return": (lambda: Task((4,)), 64, total_return),
+    "spikes_without_clipping": (lambda: Task((3,), jackpot), 300, {**one_episode, "max_grad_norm": None}),
+    # Its critic starts with wild values and does not learn
+    "useless_critic": (lambda: Task((4,), noisy), 8000, {"critic_learning_rate": 0.0, "prepare": wild_critic}),
+    "deterministic_too_early": (lambda: Task((4,)), 640, {"prepare": strong_preference}),
     "cut_episodes": (lambda: Task((3, 7)), 100, {"baseline": "mean", "n_steps": 10}),
 }
 for name, (env, timesteps, arguments) in runs.items():
     found = run(env, timesteps, **arguments)
-    print(f"{name}:\n    {found.get(name)}")
-    assert name in found
+    assert name in found, found
+    print(f"{name}:\n    {found[name]}")
 
 # %% [markdown]
 # Each sentence names the argument to change. The healthy run: CartPole with the default learning rate and rollouts of

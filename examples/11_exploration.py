@@ -1,14 +1,15 @@
 # %% [markdown]
 # # When should a policy stay random?
 #
-# A policy gradient climbs from where it stands. Randomness lets it see what lies beyond, and sometimes the best policy
-# is itself random.
+# A policy gradient climbs from where it stands. Randomness lets it see what lies beyond, and without a memory the best
+# policy may itself be random.
 
 # %%
 import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -22,8 +23,8 @@ common = {"baseline": "leave_one_out", "n_episodes": 32, "seed": seed, "device":
 # ## A local optimum
 #
 # The action is a number. Near −1 it earns up to 0.5, near 2 up to 1, and little in between. A Gaussian policy with the
-# mean −1 and the standard deviation 0.3 never sees the higher hill, and its gradient leads to the top of the lower one.
-# With a floor under the standard deviation (`min_std`) the policy sees both.
+# mean −1 and the standard deviation 0.3 almost never samples the higher hill, and stays on the lower one. With a floor
+# under the standard deviation (`min_std`) the policy sees both.
 
 
 # %%
@@ -57,8 +58,7 @@ assert means[0.0] < -0.7 and means[1.5] > 1
 #
 # Two arguments keep a policy of discrete actions random, and both can be schedules: `temperature` divides the logits,
 # and `ent_coef` rewards entropy. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. A
-# policy that commits itself early may commit itself to the wrong arm. A schedule lets it explore first and decide
-# later.
+# policy that commits early may commit to the wrong arm. A schedule keeps it random first, and lets it decide later.
 
 
 # %%
@@ -75,10 +75,25 @@ class Arms(gym.Env):
         return np.ones(1, dtype=np.float32), self.np_random.normal(1.0 + 0.1 * action), True, False, {}
 
 
-def probabilities(model, observation):
-    """π(·|s)."""
+def probabilities(model):
+    """π(·|s) for the only observation."""
     with th.no_grad():
-        return model.policy.get_distribution(th.as_tensor(observation)[None]).distribution.probs[0]
+        return model.policy.get_distribution(th.ones(1, 1)).distribution.probs[0]
+
+
+class Entropies(BaseCallback):
+    """Collects the entropy of the policy before each rollout."""
+
+    def __init__(self):
+        super().__init__()
+        self.before_rollout = []
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_start(self):
+        p = probabilities(self.model)
+        self.before_rollout.append(-th.special.xlogy(p, p).sum().item())
 
 
 schedules = {
@@ -86,33 +101,27 @@ schedules = {
     "ent_coef falls from 0.5 to 0": {"ent_coef": LinearSchedule(0.5, 0.0, 1.0)},
     "temperature falls from 5 to 0.1": {"temperature": LinearSchedule(5.0, 0.1, 1.0)},
 }
-entropies = {}
+early, late = {}, {}
 for name, arguments in schedules.items():
-    found = entropies[name] = []
-
-    def watch(local, _, found=found):
-        """Called after each step: the entropy after a tenth of the training, and at its end."""
-        if local["self"].num_timesteps in (1_000, 10_000):
-            p = probabilities(local["self"], np.ones(1, dtype=np.float32))
-            found.append(-float((p * p.clamp(min=1e-12).log()).sum()))
-        return True
-
     env = make_vec_env(Arms, 8, seed=seed)
     model = REINFORCE("MlpPolicy", env, learning_rate=0.03, policy_kwargs={"net_arch": []}, **arguments, **common)
-    model.learn(10_000, callback=watch)
-    p = probabilities(model, np.ones(1, dtype=np.float32)).tolist()
-    print(f"{name:32s} entropy {found[0]:.2f}, then {found[1]:.2f}; π = {', '.join(f'{each:.2f}' for each in p)}")
-assert all(early > entropies["neither"][0] for early, _ in list(entropies.values())[1:])
-assert all(late < early for early, late in entropies.values())
-assert entropies["temperature falls from 5 to 0.1"][1] < 0.3
+    entropies = Entropies()
+    model.learn(10_000, callback=entropies)
+    early[name] = entropies.before_rollout[len(entropies.before_rollout) // 10]
+    late[name] = entropies.before_rollout[-1]
+    p = ", ".join(f"{each:.2f}" for each in probabilities(model))
+    print(f"{name:32s} entropy {early[name]:.2f}, then {late[name]:.2f}; π = {p}")
+for name in ("ent_coef falls from 0.5 to 0", "temperature falls from 5 to 0.1"):
+    assert early[name] > early["neither"] and late[name] < early[name]
+assert late["temperature falls from 5 to 0.1"] < 0.3
 
 # %% [markdown]
-# ## A problem whose best policy is random
+# ## A problem whose best memoryless policy is random
 #
 # A corridor of three cells that look alike (Sutton and Barto, 2018, example 13.1). In the middle cell left and right
 # are exchanged. Each step costs 1 until the end on the right is reached. Always right and always left never arrive; the
-# best policy goes right with probability $2 - \sqrt 2 \approx 0.59$, and needs 11.7 steps. Q-learning with greedy
-# actions cannot represent it. A softmax can.
+# best policy without a memory goes right with probability $2 - \sqrt 2 \approx 0.59$, and needs 11.7 steps. Q-learning
+# with greedy actions cannot represent it. A softmax can. (With a memory three steps would do: right, left, right.)
 
 
 # %%
@@ -135,7 +144,7 @@ class Corridor(gym.Env):
 env = make_vec_env(Corridor, 8, seed=seed)
 model = REINFORCE("MlpPolicy", env, gamma=1.0, learning_rate=0.01, policy_kwargs={"net_arch": []}, **common)
 model.learn(30_000)
-right = probabilities(model, np.ones(1, dtype=np.float32))[1].item()
+right = probabilities(model)[1].item()
 length = np.mean([info["l"] for info in model.ep_info_buffer])
 print(f"π(right) = {right:.2f}, mean length of the last 100 episodes {length:.1f}")
 # From the three cells' equations, an episode takes 2 (2 − p) / (p (1 − p)) steps

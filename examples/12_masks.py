@@ -2,7 +2,8 @@
 # # What is an action mask worth?
 #
 # Each of 40 doors is opened by the key with its number. At each door 29 or 30 keys are known not to fit: a mask forbids
-# them. A policy without the mask could learn to avoid wrong keys, too. How much does the mask save?
+# them. A policy without the mask could learn to avoid wrong keys, too. After the same number of steps, how far are
+# they?
 
 # %%
 import gymnasium as gym
@@ -45,14 +46,14 @@ class Doors(gym.Env):
 
 
 # %% [markdown]
-# `ActionMaskObservation` puts the mask of `action_masks()`, as sb3-contrib's MaskablePPO calls it, into the
-# observation. `MaskedPolicy` gives forbidden actions the probability 0. No algorithm has to know of masks. An untrained
-# policy opens 50 / 40 = 1.25 doors without masks and about 4.7 doors with them.
+# `ActionMaskObservation` adds the mask from `action_masks()`, the name in sb3-contrib's MaskablePPO, to the
+# observation. `MaskedPolicy` gives forbidden actions the probability 0. Algorithms need no change. An untrained policy
+# opens 50 / 40 = 1.25 doors without masks and about 4.7 doors with them.
 
 # %%
-# The door's own key is among the ten others for a quarter of the doors
-untrained = 50 * (0.25 / 10 + 0.75 / 11)
-assert round(untrained, 1) == 4.7
+# The door's own key is among the ten random ones for a quarter of the doors
+untrained = {"MlpPolicy": 50 / 40, "MaskedPolicy": 50 * (0.25 / 10 + 0.75 / 11)}
+assert round(untrained["MaskedPolicy"], 1) == 4.7
 
 means = {}
 for policy, wrapper in (("MlpPolicy", None), ("MaskedPolicy", ActionMaskObservation)):
@@ -60,4 +61,9 @@ for policy, wrapper in (("MlpPolicy", None), ("MaskedPolicy", ActionMaskObservat
     model = REINFORCE(policy, env, gamma=0.0, learning_rate=0.01, seed=seed, device="cpu").learn(4_000)
     means[policy] = np.mean([episode["r"] for episode in model.ep_info_buffer][-40:])
     print(f"{policy:12s} {means[policy]:4.1f} of 50 doors in the last 40 episodes")
-assert means["MaskedPolicy"] > 2 * means["MlpPolicy"]
+learned = {policy: means[policy] - untrained[policy] for policy in means}
+assert learned["MaskedPolicy"] > 3 * learned["MlpPolicy"] > 0
+
+# %% [markdown]
+# Most of the difference is learned. With the mask an untrained policy opens almost four times as many doors, so there
+# are more successes to learn from.

@@ -1,17 +1,21 @@
 # %% [markdown]
 # # Can REINFORCE balance a pole?
 #
-# A pole stands on a cart. Each step at which it has not fallen earns 1, and an episode ends after 500 steps. A policy
-# with parameters $\theta$ draws the actions. Its utility $U(\theta) = E[\text{return}]$ has no formula: we only see
-# samples of it, one per episode.
+# A pole stands on a cart. Each step earns 1. An episode ends when the pole falls, the cart leaves the track, or after
+# 500 steps. A policy with parameters $\theta$ draws the actions. Its utility $U(\theta) = E[\text{return}]$ has no
+# formula: we only see samples of it, one per episode.
 #
 # REINFORCE (Williams, 1992) estimates the gradient of $U$ from $N$ episodes of the present policy,
 #
 # $$\hat g = \frac{1}{N} \sum_{i=1}^{N} \sum_t \nabla_\theta \log \pi_\theta(a_t \mid s_t) \, (G_t - b_t),$$
 #
-# and takes one step along it. $G_t$ is the reward from step $t$ on and $b_t$ a baseline: here the mean of $G_t$ over
-# the other episodes. The dynamics of the cart are not in the formula: they do not depend on $\theta$ and drop out of
-# $\nabla_\theta \log p_\theta(\text{episode})$.
+# and takes one step along it. $G_t$ is the sum of the rewards from step $t$ on and $b_t$ a baseline: here the mean of
+# $G_t$ over the other episodes that reach step $t$.
+#
+# Why the scores $\nabla_\theta \log \pi_\theta$? For the probability $p_\theta$ of an episode, $\nabla p_\theta =
+# p_\theta \nabla \log p_\theta$, so the gradient of an expectation is an expectation too:
+# $\nabla \sum p_\theta \cdot \text{return} = E[\text{return} \cdot \nabla \log p_\theta]$. The dynamics of the cart
+# do not depend on $\theta$ and drop out of $\nabla_\theta \log p_\theta$. Only the scores remain.
 
 # %%
 import torch as th
@@ -25,9 +29,10 @@ seed = 0
 th.set_num_threads(1)
 
 # %% [markdown]
-# Whole episodes, no critic, one policy step per 16 episodes. The policy is Stable-Baselines3's `MlpPolicy`, and its
-# optimizer Adam. Replace `REINFORCE` by `PPO`, without the two arguments `baseline` and `n_episodes`, and the rest of
-# this page stays as it is.
+# Whole episodes, no critic, one policy step per 16 episodes. The policy is Stable-Baselines3's `MlpPolicy`. By default
+# Adam takes the step, the sum is divided by the number of steps instead of $N$, and rewards are discounted with 0.99
+# (page 5 shows what that changes). Replace `REINFORCE` by `PPO`, without the arguments `baseline` and `n_episodes`, and
+# the code below runs unchanged.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
@@ -36,7 +41,8 @@ model = REINFORCE(
 )
 
 # %% [markdown]
-# Training may take 200,000 steps, but it stops as soon as 20 episodes of the most likely actions score 490 on average.
+# Training may take 200,000 steps. Every 4,000 steps 20 episodes of the most likely actions are played, and training
+# stops when they score 490 on average.
 
 # %%
 until_solved = EvalCallback(

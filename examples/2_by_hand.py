@@ -83,7 +83,8 @@ print("gradient of the weights of Left and Right:", by_episode.mean(0)[:2].tolis
 assert abs(by_episode.mean(0)[1] - gradient) < 1e-6
 
 # %% [markdown]
-# `learn` draws its own three episodes, and moves the weight by 0.1 times their gradient.
+# `learn` draws its own three episodes, and moves the weight by 0.1 times their gradient. The bias of Right and both
+# parameters of Left move as far, so $\pi(\text{Right})$ changes more than by hand.
 
 # %%
 model.learn(1)
@@ -96,9 +97,9 @@ assert abs(model.policy.action_net.weight[1].item() - expected) < 1e-6
 # ## The score has mean zero
 #
 # $E_{a \sim \pi}[\nabla \log \pi(a)] = 0$ for every policy. So a constant that is subtracted from all returns leaves
-# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$ and the mean is a sum; for
-# a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero up to its standard
-# error.
+# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$, and its mean is exact.
+# For a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero up to its
+# standard error.
 
 # %%
 probabilities = th.softmax(th.randn(4), dim=0)
@@ -114,8 +115,7 @@ assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.m
 #
 # Three actions with returns 8, 10 and 12. Without a baseline every drawn action is made more likely, only by different
 # amounts. With the mean of the batch the average action is left alone. The mean contains the return that it is
-# subtracted from, which makes the gradient too small by a factor $(N - 1) / N$; the mean of the *other* episodes does
-# not.
+# subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does not.
 
 # %%
 rollout = replace(sample(make_model(8.0, 10.0, 12.0), 3), returns=th.tensor([[8.0], [10.0], [12.0]], dtype=th.float64))
@@ -127,8 +127,7 @@ assert (rollout.returns - leave_one_out(rollout)).flatten().tolist() == [-3, 0, 
 
 # %% [markdown]
 # Without a baseline and with the constant baseline 10, the gradient has the same mean. But if every drawn action gains,
-# then most of a gradient tells which actions happened to be drawn. Over the three equally likely episodes the variance
-# can be computed exactly:
+# most of the gradient is sampling noise. Over the three equally likely episodes the variance can be computed exactly:
 
 # %%
 scores = np.eye(3) - 1 / 3

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # How large should a difference be?
 #
-# The oldest way to measure a slope: move a little, and see what changes. Nothing has to be known of the policy or of
-# the simulator. Along a perturbation $\delta$ of the parameters,
+# The oldest way to measure a slope: move a little, and see what changes. Policy and simulator may be black boxes. Along
+# a perturbation $\delta$ of the parameters,
 #
 # $$\text{forward: } \delta \, \hat g \approx U(\theta + \delta) - U(\theta), \qquad
 #   \text{central: } 2 \delta \, \hat g \approx U(\theta + \delta) - U(\theta - \delta).$$
@@ -50,7 +50,8 @@ th.testing.assert_close(central_difference(bowl, theta, deltas), -2 * theta)
 # $$\sqrt{\left(\tfrac{\delta}{2} U''\right)^2 + 2 \sigma^2 / \delta^2}:$$
 #
 # a long step sees the curvature, a short one divides the noise by a small number. The best step is in between, at
-# $\delta^4 = 8 \sigma^2 / U''^2$.
+# $\delta^4 = 8 \sigma^2 / U''^2$. The central difference has no error from the curvature of a quadratic utility, so
+# here its best step is the longest; a third derivative would end that.
 
 # %%
 sigma, repetitions = 0.1, 1000
@@ -103,25 +104,28 @@ assert round(slope) == 18 and round(standard_error) == 20
 # ## A regression knows its errors
 #
 # The regression gradient perturbs all parameters at once, $k$ times, and fits a plane to the utilities. The rule of
-# thumb is $k = 2n$. What the plane does not explain is noise, so the fit comes with a standard error for each
-# component. Over many repetitions, errors divided by their standard errors follow Student's $t$.
+# thumb is $k = 2n$. What the plane does not explain is noise or curvature, so the fit comes with a standard error for
+# each component. Here the utility is linear, and all of it is noise. Over many repetitions, errors divided by their
+# standard errors follow Student's $t$.
 
 # %%
 slopes = th.tensor([2.0, -1.0, 0.5], dtype=th.float64)
-errors, sizes = {}, {}
-for k in (6, 12, 24):
-    fits = []
-    for _ in range(300):
-        deltas = th.randn(k, 3, dtype=th.float64)
-        utilities = (theta + deltas) @ slopes + th.randn(k, dtype=th.float64)
-        gradient = regression_gradient(lambda thetas, measured=utilities: measured, theta, deltas)
-        standard_error = fit_quality(theta + deltas, utilities, gradient).standard_error
-        fits.append(th.stack([gradient - slopes, standard_error]))
-    error, standard_error = th.stack(fits, dim=1)
-    sizes[k] = standard_error.mean().item()
-    # 95 % of Student's t with k - 4 degrees of freedom: k utilities, less 3 slopes and a level
-    quantile = {6: 4.303, 12: 2.306, 24: 2.086}[k]
-    share = (error.abs() < quantile * standard_error).double().mean().item()
+
+
+def fit(k):
+    """The errors of the slopes, and their standard errors."""
+    deltas = th.randn(k, 3, dtype=th.float64)
+    utilities = (theta + deltas) @ slopes + th.randn(k, dtype=th.float64)
+    gradient = regression_gradient(lambda thetas: utilities, theta, deltas)
+    return th.stack([gradient - slopes, fit_quality(theta + deltas, utilities, gradient).standard_error])
+
+
+sizes = {}
+# The 97.5 % quantiles of Student's t with k - 4 degrees of freedom: k utilities, less 3 slopes and a level
+for k, quantile in {6: 4.303, 12: 2.306, 24: 2.086}.items():
+    errors, standard_errors = th.stack([fit(k) for _ in range(300)], dim=1)
+    sizes[k] = standard_errors.mean().item()
+    share = (errors.abs() < quantile * standard_errors).double().mean().item()
     print(f"k = {k:2d}: mean standard error {sizes[k]:.2f}, {share:.1%} of the truths within the 95 % interval")
     assert abs(share - 0.95) < 0.035
 assert sizes[6] > sizes[12] > sizes[24]

@@ -2,8 +2,8 @@
 # # Which baseline leaves the least noise?
 #
 # A baseline $b_t$ is subtracted from the return before it weighs the score. It leaves the expected gradient alone as
-# long as it does not depend on the action. How much noise it removes depends on what it may depend on: nothing, the
-# time, or the state.
+# long as it depends neither on the action nor on its consequences. How much noise it removes depends on what it may
+# depend on: nothing, the time, or the state.
 
 # %%
 import gymnasium as gym
@@ -24,10 +24,10 @@ th.set_num_threads(1)
 # %% [markdown]
 # ## A bandit
 #
-# Two actions with rewards from $N(3, 4)$ and $N(5, 4)$, and gradients of 20 rollouts. Here every variance has a
-# formula. The optimal baseline is the constant of least variance, the mean of the returns weighted by the squared
-# length of their scores. For a uniform policy all scores have one length, and it is the mean of the returns. For a
-# policy that prefers an action it is better than the mean.
+# Two actions with rewards from $N(3, 4)$ and $N(5, 4)$, and gradients of 20 episodes. Here every variance has a
+# formula, for baselines that are known. The optimal baseline is the constant of least variance, the mean of the returns
+# weighted by the squared length of their scores. For a uniform policy all scores have one length, and it is the mean of
+# the returns. For a policy that prefers an action it is better than the mean.
 
 
 # %%
@@ -58,15 +58,16 @@ for ax, p in zip(axes, (0.5, 0.8), strict=True):
     rollout = sample(model, 10_000)
     measured = []
     for name, truth in zip(names, exact, strict=True):
-        # A sample of the variance of 20 rollouts is the variance of one, divided by 20
+        # The baselines are estimated from so many episodes that they are as good as known. The mean of 20 gradients
+        # has a twentieth of the variance of one
         (gradients,) = gradients_by_episode(rollout, rollout.returns - BASELINES[name](rollout))
         measured.append(gradients.var(0).sum().item() / 20)
         print(f"p = {p}, {name:8s} variance {measured[-1]:.3f}, exact {truth:.3f}")
     assert np.allclose(measured, exact, rtol=0.08)
-    ax.bar(names, measured, color="#56B4E9", label="10,000 rollouts")
+    ax.bar(names, measured, color="#56B4E9", label="10,000 episodes")
     ax.plot(exact, linestyle="", marker="D", color="#D55E00", label="exact")
     ax.set(title=f"better action with probability {p}", xlabel="baseline")
-axes[0].set_ylabel("variance of the gradient of 20 rollouts")
+axes[0].set_ylabel("variance of the gradient of 20 episodes")
 axes[1].legend(frameon=False)
 plt.show()
 
@@ -74,8 +75,8 @@ plt.show()
 # ## CartPole
 #
 # Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
-# baseline on the same 200 episodes. The ratio compares a baseline with "none" on the same resamples: for "optimal", its
-# interval is narrower than the interval of the variance, relative to the estimates.
+# baseline on the same 200 episodes. The ratio to "none" uses the same resamples for both. So for "optimal" its relative
+# interval is narrower than the variance's.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
@@ -90,11 +91,10 @@ plt.show()
 
 # %% [markdown]
 # "optimal" is only the best *constant*; "time_mean" and "leave_one_out" depend on the step, "value" on the state. Which
-# is best depends on the task. Here the constant leaves less noise than "leave_one_out": long episodes have long scores,
-# and the constant gives them more weight. Hollow markers are biased: "time_mean" contains the return that it is
-# subtracted from, and so shrinks the gradient of $N$ episodes of one length to $(N - 1) / N$, noise included.
-# "leave_one_out" is the same without that bias. The floor takes the best constant for each single component of the
-# gradient.
+# is best depends on the task. Here the constant leaves less noise than "leave_one_out". Hollow markers are biased, or
+# may be: "time_mean" contains the return that it is subtracted from, and so shrinks the gradient of $N$ episodes of one
+# length to $(N - 1) / N$, noise included. "leave_one_out" is the same without that bias. The floor takes the best
+# constant for each single component of the gradient.
 
 # %%
 ratio = {row.baseline: row.ratio.value for row in table}

@@ -75,7 +75,8 @@ class FiniteDifference(BasePolicyGradient):
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
     :param n_eval_episodes: Episodes behind each utility, which is their mean
-    :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of the start from differences, but environments idle until the longest episode of a round ends
+    :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
+        the start from differences, but environments idle until the longest episode of a round ends
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
     :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
         ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``

@@ -1,8 +1,8 @@
 """
 How fast does CnnPolicy learn from images, on a GPU or not?
 
-Images of Atari's size (84 x 84 x 4), REINFORCE beside A2C with rollouts of 32 steps and their other defaults; the environments show prepared
-images, so the networks and the way of the observations to them are what is measured.
+Images of Atari's size (84 x 84 x 4), REINFORCE beside A2C with rollouts of 32 steps and their other defaults; the
+environments show prepared images, so the networks and the way of the observations to them are what is measured.
 
     python examples/benchmarks/images.py --device cuda --n-envs 16 64
 """
@@ -60,7 +60,6 @@ def main() -> None:
             rates = [
                 learning(algorithm, "CnnPolicy", make_vec_env(Images, n_envs), arguments.timesteps, **kwargs)
                 for algorithm in (REINFORCE, A2C)
-
             ]
             ratios.append(rates[0] / rates[1])
         writer.writerow([n_envs, arguments.device, f"{statistics.median(ratios):.2f}"])

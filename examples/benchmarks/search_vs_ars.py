@@ -19,7 +19,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
-
 # As they are called in the results, and in rl_zoo3.ALGOS
 NAMES = {"FiniteDifference": "finite_difference", "ARS": "ars"}
 

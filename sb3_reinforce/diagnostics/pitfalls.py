@@ -133,7 +133,7 @@ def uses_total_return(history: History) -> str | None:
     if not history.model.reward_to_go and history.updates[-1].n_steps > history.updates[-1].n_episodes:
         return (
             "Every action is weighted by the total return, which includes rewards from before it. Set "
-            "reward_to_go=True: the gradient is the same and its variance lower"
+            "reward_to_go=True, whose gradient has a lower variance"
         )
     return None
 

@@ -12,7 +12,8 @@ class LinearPolicy(ActorCriticPolicy):
     """
     An ``ActorCriticPolicy`` whose means or logits are ``W s``, linear in the (flattened) observation.
 
-    No hidden layers, and the bias stays 0, as in ARS: observations are often small, and a perturbed bias alone would decide every action. The actor has (observation dimension) × (number of means or logits) parameters.
+    No hidden layers, and the bias stays 0, as in ARS: observations are often small, and a perturbed bias alone would
+    decide every action. The actor has (observation dimension) × (number of means or logits) parameters.
 
     :param observation_space: Observation space
     :param action_space: Action space
