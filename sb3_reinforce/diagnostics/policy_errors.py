@@ -1,7 +1,8 @@
 """Errors of a policy that ``check_gradient`` measures: how far the two sides of each identity of log π are apart."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch as th
 from gymnasium import spaces
@@ -61,19 +62,36 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
 
 def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
-    ``difference_error`` at θ, or a fifth of it with the last layer's weights scaled to norm √n_out, if that is larger.
+    ``difference_error``, and a fifth of it with the last layer scaled up to outputs of about 1, if that is larger.
 
-    The last layer of a new policy has small weights, with which the scores of the others hardly count at θ. With
-    larger weights log π is curved more.
+    The last layer of a new policy has small weights, with which the scores of the others hardly count. With larger
+    weights log π is curved more. Large logits are scaled down to 1: log π of an almost deterministic policy is mostly
+    rounding.
     """
-    error = difference_error(policy, obs, actions)
     layer = getattr(policy, "action_net", None)
     if not isinstance(layer, th.nn.Linear):
-        return error
+        return difference_error(policy, obs, actions)
+    outputs: list[th.Tensor] = []
+    handle = layer.register_forward_hook(lambda _, inputs, output: outputs.append((output - layer.bias).detach()))
+    log_prob_of(policy, obs, actions)
+    handle.remove()
+    scale = 1 / float(outputs[0].square().mean().sqrt().clamp(min=1e-6))
+    are_logits = not isinstance(policy.action_space, spaces.Box)
+    with scaled(layer, min(1.0, scale) if are_logits else 1.0):
+        error = difference_error(policy, obs, actions)
+    if scale > 1:
+        with scaled(layer, scale):
+            error = max(error, difference_error(policy, obs, actions) / 5)
+    return error
+
+
+@contextmanager
+def scaled(layer: th.nn.Linear, scale: float) -> Iterator[None]:
+    """Multiply the weights of a layer in the block."""
     before = layer.weight.detach().clone()
-    write([layer.weight], (before * max(1.0, len(before) ** 0.5 / float(before.norm().clamp(min=1e-6)))).flatten())
+    write([layer.weight], (before * scale).flatten())
     try:
-        return max(error, difference_error(policy, obs, actions) / 5)
+        yield
     finally:
         write([layer.weight], before.flatten())
 
@@ -132,7 +150,7 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
         before, after = closeness_after_step(policy, one, action, n_draws)
         if before < closeness(policy, action[None].expand_as(draws), action):
-            wrong.append(bool(after <= before))
+            wrong.append(bool(after < before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -249,3 +250,33 @@ def test_a_learning_rate_that_has_just_been_changed():
     assert check_gradient(model).passed
     model.learn(64)
     assert model.policy.optimizer.param_groups[0]["lr"] == 0.25
+
+
+class Sides(gym.Env):
+    """One side of the image is bright, and naming it earns 1."""
+
+    observation_space, action_space = spaces.Box(0, 255, (36, 36, 1), np.uint8), spaces.Discrete(2)
+
+    def observe(self):
+        image = np.zeros((36, 36, 1), np.uint8)
+        self.side = int(self.np_random.integers(2))
+        image[8:28, 18 * self.side : 18 * self.side + 18] = self.np_random.integers(100, 255)
+        return image
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        reward = float(action == self.side)
+        self.t += 1
+        return self.observe(), reward, self.t == 10, False, {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_policy_that_has_learned_to_be_almost_deterministic_passes(seed):
+    """Its log π is mostly rounding, and the more so with a larger last layer."""
+    model = REINFORCE("CnnPolicy", make_vec_env(Sides, 8, seed=seed), device="cpu", seed=seed).learn(4096)
+    assert check_gradient(model).passed
