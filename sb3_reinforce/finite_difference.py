@@ -39,7 +39,7 @@ from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import trainable
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.sampling.normalization import frozen
+from sb3_reinforce.sampling.normalization import check_scale, frozen
 from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
@@ -60,8 +60,9 @@ class FiniteDifference(BasePolicyGradient):
     of one VecEnv, in one batched forward pass.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
-    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it, but of the
-    scaled ones where a wrapper above it may change rewards (one that Stable-Baselines3 does not have).
+    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it. Below a
+    wrapper that may change rewards (one that Stable-Baselines3 does not have) they are sums of the wrapper's rewards,
+    and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -285,6 +286,7 @@ class FiniteDifference(BasePolicyGradient):
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
+            check_scale(self.env)
             with frozen(self.env) as observed:
                 utility = EpisodicUtility(self, searched, callback, observed, first_seed)
                 try:

@@ -15,7 +15,7 @@ from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, 
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
 from sb3_reinforce.envs.starts import reseed
 from sb3_reinforce.estimation import baselines
-from sb3_reinforce.estimation.estimators import ESTIMATORS
+from sb3_reinforce.estimation.estimators import ESTIMATORS, check_tensor
 from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
@@ -112,7 +112,8 @@ def compare_estimators(
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
                 k = default_n_delta(name, n_parameters) if n_delta is None else n_delta
-                deltas = (scale * draw(k, n_parameters, generator) for _ in range(n_estimates))
+                directions = (draw(k, n_parameters, generator) for _ in range(n_estimates))
+                deltas = (scale * check_tensor("perturbation", each, (k, n_parameters)) for each in directions)
                 gradients = th.stack([ESTIMATORS[name](utility, utility.theta, each) for each in deltas])
                 n_steps = utility.n_steps - n_steps_before
             seconds = (time.perf_counter() - begin) / len(gradients)

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -155,8 +155,12 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.boo
     if mode is AutoresetMode.DISABLED:
         wrapper = env
         while isinstance(wrapper, VectorWrapper):
-            if isinstance(wrapper, RecordEpisodeStatistics):
-                raise ValueError(f"{env} would forget the episodes that go on when others end: use VecMonitor instead")
+            # A reset by mask clears what they know of all copies
+            for forgetful, instead in ((RecordEpisodeStatistics, "VecMonitor"), (NormalizeReward, "VecNormalize")):
+                if isinstance(wrapper, forgetful):
+                    raise ValueError(
+                        f"{env} would forget the episodes that go on when others end: use {instead} instead"
+                    )
             wrapper = wrapper.env
         return restart_by_mask
     if type(env) is CartPoleVectorEnv:

@@ -112,7 +112,7 @@ def evaluate(
     """
     log π(a|s), the entropy of π(·|s), and V(s) or None, each of shape ``(n,)``.
 
-    An entropy without closed form (squashed Gaussian) is estimated by −log π(a|s).
+    An entropy without closed form (squashed Gaussian) is estimated, its gradient by the likelihood ratio.
     """
     values: th.Tensor | None = None
     if route.evaluate_actions:
@@ -128,7 +128,9 @@ def evaluate(
         if with_values:
             values = policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
     if entropy is None:
-        entropy = -log_prob
+        # H = −E[log π], ∇H = −E[log π ∇ log π]
+        constant = log_prob.detach()
+        entropy = -constant * (1 + log_prob - constant)
     return log_prob, entropy, None if values is None else values.flatten()
 
 
@@ -242,4 +244,6 @@ def floor_std(policy: ActorCriticPolicy, min_std: float) -> None:
     if min_std > 0:
         if not hasattr(policy, "log_std"):
             raise ValueError(f"min_std needs a policy with a log_std, and {type(policy).__name__} has none")
-        policy.log_std.clamp_(min=math.log(min_std))
+        # With use_expln, σ is 1 + log(1 + log_std) above 1
+        is_expln = min_std > 1 and getattr(policy.action_dist, "use_expln", False)
+        policy.log_std.clamp_(min=math.expm1(min_std - 1) if is_expln else math.log(min_std))

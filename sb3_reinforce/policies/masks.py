@@ -119,7 +119,7 @@ class MaskedExtractor(BaseFeaturesExtractor):
     """The features and the mask behind them, ``(n, features_dim + n_actions)``; ``features_dim`` sizes the layers."""
 
     def __init__(self, space: spaces.Dict, extractor: BaseFeaturesExtractor):
-        super().__init__(space, extractor.features_dim)
+        super().__init__(space, int(extractor.features_dim))
         self.extractor = extractor
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:

@@ -10,15 +10,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.policies import parameters
-from sb3_reinforce.policies.evaluation import distribution_of
-from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, temperature_hooks
+from sb3_reinforce.policies.evaluation import distribution_of, extract_features
+from sb3_reinforce.policies.plain_mlp import plain_actor, temperature_hooks
 
 
 class LoopActor:
@@ -48,6 +48,9 @@ class LoopActor:
         try:
             for i, theta in enumerate(self.thetas):
                 parameters.write(self.searched, theta)
+                if self.policy.use_sde and not self.deterministic:
+                    # Else all episodes would share the noise that the last rollout has left
+                    self.policy.reset_noise()
                 action, _ = self.policy.predict(take(obs, slice(i, i + 1)), deterministic=self.deterministic)
                 actions.append(action)
         finally:
@@ -70,7 +73,6 @@ class MatrixActor:
         self.searched = searched
         self.deterministic = deterministic
         self.device = policy.device
-        self.takes_vectors = takes_vectors(policy, policy.pi_features_extractor)
         self.as_env_actions = env_actions_of(policy)
         self.temperatures = [hook.temperature for hook in temperature_hooks(layers[-1])]
 
@@ -103,7 +105,7 @@ class MatrixActor:
 
     def outputs(self, obs: Any) -> th.Tensor:
         """Means or logits, shape ``(n_envs, n_outputs)``, without a graph, since the stacks require no gradient."""
-        x = self.features(obs)[:, None]
+        x = extract_features(self.policy, obs_as_tensor(obs, self.device), self.policy.pi_features_extractor)[:, None]
         for operation in self.operations:
             if isinstance(operation, tuple):
                 weight, bias = operation
@@ -113,15 +115,6 @@ class MatrixActor:
         for temperature in self.temperatures:
             x = x / temperature
         return x[:, 0]
-
-    def features(self, obs: Any) -> th.Tensor:
-        """The flattened observations, shape ``(n_envs, n_features)``."""
-        if self.takes_vectors:
-            # The result of the lines below, for a tenth of their price
-            return th.from_numpy(obs).to(self.device, th.float32).flatten(1)
-        return BasePolicy.extract_features(
-            self.policy, obs_as_tensor(obs, self.device), self.policy.pi_features_extractor
-        )
 
 
 # Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters

@@ -132,8 +132,9 @@ def collect(
             model._update_info_buffer([infos[i] for i in counted], dones[counted])
             for i in counted:
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
-                    # Some VecEnvs write the next terminal observation into the same array
-                    terminal_obs[n_steps - 1, i] = deepcopy(infos[i]["terminal_observation"])
+                    # Of a dict only what the space has; some VecEnvs write the next one into the same array
+                    found = map_parts(lambda _, part: part, new_obs, infos[i]["terminal_observation"])
+                    terminal_obs[n_steps - 1, i] = deepcopy(found)
         if is_attached and not actor.is_current(model.policy):
             write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy

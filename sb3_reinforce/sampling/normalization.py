@@ -61,6 +61,16 @@ def original_reward_of(env: VecEnv) -> Callable[[], np.ndarray] | None:
     return found
 
 
+def check_scale(env: VecEnv | None) -> None:
+    """Refuse a VecNormalize whose scale of the rewards is used, but would never be learned."""
+    learning = [each for each in normalizers(env) if each.training and each.norm_reward]
+    if learning and env is not None and original_reward_of(env) is None:
+        raise ValueError(
+            "VecNormalize must have norm_reward=False below a wrapper that may change rewards "
+            f"({type(env).__name__}): while candidates are compared its scale stands still"
+        )
+
+
 @contextmanager
 def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
     """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""

@@ -35,6 +35,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.common import settings
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
+from sb3_reinforce.policies.evaluation import MIN_TEMPERATURE, floor_std
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
@@ -296,6 +297,21 @@ def test_temperature_divides_the_logits(space):
     th.testing.assert_close(*(model.policy.evaluate_actions(obs, actions)[1:] for model in models))
 
 
+def test_a_temperature_that_a_callback_sets_at_the_start_of_a_rollout_acts_in_it():
+    change = Record(lambda model: setattr(model, "temperature", 5.0 + model.num_timesteps), at="rollout_start")
+    temperatures = Record(temperature_of, at="step")
+    make("steps", n_steps=4).learn(8, callback=[change, temperatures])
+    assert temperatures.records == pytest.approx([5.0] * 4 + [9.0] * 4)
+
+
+def test_temperature_may_fall_to_zero_before_the_end():
+    temperatures = Record(temperature_of)
+    make("steps", n_steps=16, temperature=LinearSchedule(1.0, 0.0, 0.5)).learn(64, callback=temperatures)
+    assert temperatures.records == pytest.approx([1.0, 0.5, MIN_TEMPERATURE, MIN_TEMPERATURE])
+    with pytest.raises(ValueError, match="temperature must be in"):
+        make("steps", temperature=0.0)
+
+
 def test_temperature_may_fall_to_zero(tmp_path):
     """As "linearly to 0" does: the last policy is its own mode, and so is a model loaded at the end."""
     model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, temperature=LinearSchedule(1.0, 0.0, 1.0), device="cpu")
@@ -322,6 +338,15 @@ def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
     REINFORCE("MlpPolicy", "Pendulum-v1", **low).save(tmp_path / "model")
     model = REINFORCE.load(tmp_path / "model", env=gym.make("Pendulum-v1"), min_std=0.5, learning_rate=0.0)
     assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("min_std", [0.5, 5.0])
+def test_min_std_is_a_floor_where_the_deviation_is_no_exponential(min_std):
+    policy_kwargs = {"use_expln": True, "log_std_init": -3.0}
+    policy = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=policy_kwargs).policy
+    floor_std(policy, min_std)
+    stds = policy.action_dist.get_std(policy.log_std)
+    assert stds.min().item() == pytest.approx(min_std, rel=1e-4)
 
 
 @pytest.mark.parametrize("force_reset", [True, False])

@@ -5,15 +5,19 @@ have logged: a linear policy, plain gradient steps at rate 1, so that the parame
 Rewards are powers of ten and observations one-hot, so that every weight of every step can be read from ĝ.
 """
 
+import math
+
 import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation.weights import standardize
+from sb3_reinforce.policies.evaluation import evaluate, route_of
 
 GAMMA = 0.5
 N_OBS = 5
@@ -283,3 +287,29 @@ def test_clipping_keeps_the_direction(max_grad_norm):
     assert np.linalg.norm(step) == pytest.approx(max_grad_norm, rel=1e-4)
     np.testing.assert_allclose(step / max_grad_norm, whole / np.linalg.norm(whole), atol=1e-5)
     assert clipped.logger.name_to_value["train/grad_norm"] == pytest.approx(np.linalg.norm(whole), rel=1e-5)
+
+
+def test_the_entropy_bonus_raises_the_entropy_of_a_squashed_gaussian():
+    """
+    H(tanh x) = H(x) + E log(1 − tanh² x) has no closed form, and E ∇ log π = 0: −log π has the right mean, but not the
+    right gradient. The derivative by a common shift of log σ is taken by differences with the same noise.
+    """
+    env = make_vec_env(lambda: Corridor((1,), action_space=spaces.Box(-1, 1, (1,))), 1)
+    policy_kwargs = {"squash_output": True, "net_arch": [], "log_std_init": 0.0}
+    policy = REINFORCE("MlpPolicy", env, use_sde=True, policy_kwargs=policy_kwargs, seed=0, device="cpu").policy
+    obs = th.ones(20_000, 1)
+    with th.no_grad():
+        distribution = policy.get_distribution(obs).distribution
+        mean, std, noise = distribution.mean, distribution.stddev, th.randn(20_000, 1)
+
+        def entropy(shift):
+            x = (mean + std * math.exp(shift) * noise).double()
+            return float((shift + th.log1p(-x.tanh().square())).mean())
+
+        policy.reset_noise(20_000)
+        actions = policy.get_distribution(obs).get_actions()
+    _, found, _ = evaluate(policy, route_of(policy), obs, actions, with_values=False)
+    (gradient,) = th.autograd.grad(found.mean(), [policy.log_std])
+    expected = (entropy(0.01) - entropy(-0.01)) / 0.02
+    assert abs(expected) > 0.1
+    assert gradient.sum().item() == pytest.approx(expected, abs=0.06)

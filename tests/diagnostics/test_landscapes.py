@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from enumeration import make_model, true_gradient
 from environments import Corridor, Scales, Tree
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -52,6 +53,21 @@ def test_pictures_without_matplotlib_say_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'sb3-reinforce\[plots\]'"):
         importlib.import_module("sb3_reinforce.diagnostics.plots")
+
+
+@pytest.mark.parametrize(
+    ("perturbation", "sentence"),
+    [
+        (lambda k, n, generator: th.randn(k, n, generator=generator), None),
+        (lambda k, n, generator: th.randn(k, n + 1, generator=generator), "perturbation must return a tensor of shape"),
+    ],
+)
+def test_the_estimators_take_the_perturbations_that_a_search_takes(perturbation, sentence):
+    if sentence is None:
+        assert len(compare_estimators(bandit(), 4, 3, perturbation=perturbation)) == 4
+    else:
+        with pytest.raises(ValueError, match=sentence):
+            compare_estimators(bandit(), 4, 3, perturbation=perturbation)
 
 
 @pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])
@@ -213,3 +229,15 @@ def test_afterwards_the_environments_are_independent():
     env = make_vec_env("Pendulum-v1", 4, seed=0)
     landscape(REINFORCE("MlpPolicy", env, device="cpu"), n_points=2, n_episodes=1)
     assert len(np.unique(env.reset(), axis=0)) == 4
+
+
+def test_the_utility_of_a_policy_with_gsde_has_new_noise_in_each_step():
+    """The reward is the action, whose mean is 0: the mean of 2000 returns does not depend on one noise matrix."""
+    env = make_vec_env(lambda: Corridor((1,), lambda t, action: float(action[0]), spaces.Box(-1e3, 1e3, (1,))), 8)
+    policy_kwargs = {"net_arch": [], "log_std_init": 0.0}
+    model = REINFORCE("MlpPolicy", env, use_sde=True, sde_sample_freq=1, policy_kwargs=policy_kwargs, seed=0)
+    th.nn.init.zeros_(model.policy.action_net.weight)
+    for _ in range(3):
+        model.policy.reset_noise(8)
+        utility = CandidateUtility(model, 2000, seed=0)
+        assert abs(float(utility(utility.theta[None]))) < 4.5 / 2000**0.5

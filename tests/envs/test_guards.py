@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At
-from environments import Corridor, Faulty
+from environments import Corridor, Faulty, Random
 from gymnasium import spaces
 from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
@@ -380,3 +380,16 @@ def test_learning_within_a_callback(fault, kind):
         make(kind, env).learn(400, callback=At(3, lambda model: other.learn(24)))
     assert other.num_timesteps == 32
     assert_finite_statistics(env)
+
+
+@pytest.mark.parametrize("kind", ["steps", "search"])
+def test_what_a_dict_has_besides_its_space_is_left_alone(kind):
+    """Also in the last observation before a time limit, whose value the critic predicts."""
+
+    class Noted(Random):
+        def observe(self):
+            return {**super().observe(), "note": "text"}
+
+    space = spaces.Dict({"x": spaces.Box(-1, 1, (3,))})
+    model = make(kind, Noted(space), policy="MultiInputPolicy")
+    assert model.learn(64).num_timesteps >= 64

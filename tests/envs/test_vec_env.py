@@ -6,7 +6,7 @@ import pytest
 from environments import Corridor
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from models import make
 from packaging.version import Version
 from stable_baselines3 import A2C, PPO
@@ -283,3 +283,9 @@ def test_environments_of_one_class_with_different_modes(mode, monkeypatch):
     adapter.reset()
     # Each step is a whole episode, with no step in between that only resets
     assert all(step(adapter)[2].all() for _ in range(3))
+
+
+def test_a_wrapper_that_forgets_the_episodes_that_go_on_is_refused():
+    env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=AutoresetMode.DISABLED)
+    with pytest.raises(ValueError, match="use VecNormalize"):
+        GymnasiumVecEnv(NormalizeReward(env))

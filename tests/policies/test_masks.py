@@ -46,6 +46,7 @@ TASKS = {
     "discrete": (VECTOR, spaces.Discrete(5)),
     "multidiscrete": (VECTOR, spaces.MultiDiscrete([2, 4, 3])),
     "image": (spaces.Dict({"image": IMAGE, "vector": VECTOR}), spaces.Discrete(5)),
+    "numbers": (spaces.MultiDiscrete([2, 3]), spaces.Discrete(5)),
 }
 
 

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sb3_reinforce import FiniteDifference
 from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.starts import start_episodes
 from sb3_reinforce.policies import parameters
@@ -277,3 +278,10 @@ def halved(env):
 def test_the_rewards_are_those_below_vec_normalize_and_above_other_wrappers(wrap, expected):
     """One step of reward 1: a wrapper above VecNormalize has changed what it has scaled."""
     assert evaluate(wrap(DummyVecEnv([Counting])), [1])[0][0, 0] == pytest.approx(expected)
+
+
+def test_a_scale_that_is_never_learned_is_refused():
+    """While candidates are compared, a VecNormalize learns nothing: it would clip rewards of any size to ±10."""
+    env = Shifted(VecNormalize(DummyVecEnv([Counting])))
+    with pytest.raises(ValueError, match=r"norm_reward=False below a wrapper .* \(Shifted\)"):
+        FiniteDifference("LinearPolicy", env, n_delta=4, seed=0).learn(1)
