@@ -101,24 +101,31 @@ def check_device(name: str, value: Any) -> Any:
 
 
 class CheckedSchedule(FloatSchedule):
-    """A number, or a function of the remaining progress (from 1 to 0), whose every value is checked."""
+    """
+    A number, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    def __init__(self, name: str, schedule: Any, low: float, high: float = MAX, above: bool = False):
+    With ``above``, ``low`` is excluded until the end of training, or with ``may_reach`` only at its start.
+    """
+
+    def __init__(
+        self, name: str, schedule: Any, low: float, high: float = MAX, above: bool = False, may_reach: bool = False
+    ):
         check_kind(name, schedule, (Real, Callable), "a number or a schedule")
         super().__init__(schedule if callable(schedule) else check_number(name, schedule, low, high, above))
         self.given = schedule
         self.check = partial(check_number, low=low, high=high)
         self.name = name
         self.above = above
+        self.may_reach = may_reach
         for progress_remaining in (1.0, 0.0):
             self(progress_remaining)
 
     def __call__(self, progress_remaining: float) -> float:
         value: Any = self.value_schedule(progress_remaining)
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
-        # At the end of training nothing is drawn any more, so that a schedule may fall to an excluded bound
-        above = self.above and progress_remaining > 0
-        return self.check(f"{self.name} (at progress {progress_remaining:g})", value, above=above)
+        # At the end of training nothing is drawn any more
+        is_excluded = progress_remaining == 1 if self.may_reach else progress_remaining > 0
+        return self.check(f"{self.name} (at progress {progress_remaining:g})", value, above=self.above and is_excluded)
 
 
 def optional(check: Check) -> Check:

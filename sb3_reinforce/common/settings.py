@@ -79,13 +79,6 @@ def check_callback(name: str, value: Any) -> Any:
     return value
 
 
-def check_temperature(name: str, value: Any) -> CheckedSchedule:
-    """Return the schedule of a temperature. Only a schedule may be 0, which acts almost deterministically."""
-    if not callable(value):
-        check_number(name, value, low=0, high=MAX_TEMPERATURE, above=True)
-    return CheckedSchedule(name, value, low=0, high=MAX_TEMPERATURE)
-
-
 check_count = partial(check_integer, low=1)
 COMMON_ARGUMENTS: dict[str, Check] = {
     "policy": partial(check_kind, kinds=(str, type), allowed="a name or a class"),
@@ -115,7 +108,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "n_critic_updates": check_count,
     "batch_size": check_count,
     "critic_learning_rate": optional(partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE)),
-    "temperature": check_temperature,
+    "temperature": partial(CheckedSchedule, low=0, above=True, may_reach=True, high=MAX_TEMPERATURE),
     "min_std": partial(check_number, low=0, high=MAX_STD),
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),
