@@ -69,7 +69,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
     ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"`` or
     ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no normalization or
-    clipping, E[ĝ] is exactly ∇θ E[G_0]; with gSDE only for ``sde_sample_freq=1``.
+    clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
+    gradient where the noise depends on the features.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -313,14 +314,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         # The last rollout may have the columns of several processes
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
-        if self.use_sde:
-            self.policy.reset_noise(env.num_envs)
         n_steps = self.n_steps
         callback.on_rollout_start()
         # The user or a callback may have changed arguments
         check_reinforce(self, BASELINES)
         check_starts(self)
         self._apply_temperature_and_floor()
+        if self.use_sde:
+            self.policy.reset_noise(env.num_envs)
         if self.n_steps != n_steps:
             n_rollout_steps = self.n_steps
         self.start_round()

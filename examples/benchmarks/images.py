@@ -54,7 +54,6 @@ def main() -> None:
     writer.writerow(["n_envs", "device", "REINFORCE / A2C"])
     for n_envs in arguments.n_envs:
         kwargs = {"n_steps": 32, "device": arguments.device}
-
         ratios = []
         for _ in range(arguments.rounds):
             rates = [

@@ -22,8 +22,9 @@ class CandidateUtility:
     """
     ``U(θ) = E[Σ_t r_t]`` of parameter vectors: the mean return of episodes in a model's environments.
 
-    The policy samples its actions, with gSDE from new noise at each step, so this is the utility whose gradient
-    REINFORCE estimates at γ = 1. Candidates share their seeds as in FiniteDifference; every call uses new ones.
+    The policy samples its actions, so this is the utility whose gradient REINFORCE estimates at γ = 1. With gSDE each
+    step has new noise, as with ``sde_sample_freq=1``. Candidates share their seeds as in FiniteDifference; every call
+    uses new ones.
 
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility

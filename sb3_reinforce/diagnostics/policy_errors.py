@@ -71,11 +71,11 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     layer = getattr(policy, "action_net", None)
     if not isinstance(layer, th.nn.Linear):
         return difference_error(policy, obs, actions)
-    outputs: list[th.Tensor] = []
-    handle = layer.register_forward_hook(lambda _, inputs, output: outputs.append((output - layer.bias).detach()))
-    log_prob_of(policy, obs, actions)
-    handle.remove()
-    scale = 1 / float(outputs[0].square().mean().sqrt().clamp(min=1e-6))
+    size = size_of_outputs(layer, lambda: log_prob_of(policy, obs, actions))
+    if size == 0:
+        # Not the layer that the distribution comes from
+        return difference_error(policy, obs, actions)
+    scale = 1 / size
     are_logits = not isinstance(policy.action_space, spaces.Box)
     with scaled(layer, min(1.0, scale) if are_logits else 1.0):
         error = difference_error(policy, obs, actions)
@@ -83,6 +83,21 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
         with scaled(layer, scale):
             error = max(error, difference_error(policy, obs, actions) / 5)
     return error
+
+
+def size_of_outputs(layer: th.nn.Linear, evaluate: Callable[[], object]) -> float:
+    """The root mean square of ``W x`` of a layer in an evaluation; 0 if the layer is not called."""
+    sizes = [0.0]
+
+    def measure(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> None:
+        sizes.append(th.nn.functional.linear(inputs[0], layer.weight).square().mean().sqrt().item())
+
+    handle = layer.register_forward_pre_hook(measure)
+    try:
+        evaluate()
+    finally:
+        handle.remove()
+    return sizes[-1]
 
 
 @contextmanager
@@ -150,7 +165,9 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
         before, after = closeness_after_step(policy, one, action, n_draws)
         if before < closeness(policy, action[None].expand_as(draws), action):
-            wrong.append(bool(after < before))
+            # The count of a rare action may happen to stay the same
+            if after != before:
+                wrong.append(bool(after < before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
 
 

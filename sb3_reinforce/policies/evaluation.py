@@ -244,6 +244,6 @@ def floor_std(policy: ActorCriticPolicy, min_std: float) -> None:
     if min_std > 0:
         if not hasattr(policy, "log_std"):
             raise ValueError(f"min_std needs a policy with a log_std, and {type(policy).__name__} has none")
-        # With use_expln, σ is 1 + log(1 + log_std) above 1
-        is_expln = min_std > 1 and getattr(policy.action_dist, "use_expln", False)
-        policy.log_std.clamp_(min=math.expm1(min_std - 1) if is_expln else math.log(min_std))
+        if min_std > 1 and getattr(policy.action_dist, "use_expln", False):
+            raise ValueError(f"min_std must be at most 1 with use_expln=True, got {min_std}")
+        policy.log_std.clamp_(min=math.log(min_std))

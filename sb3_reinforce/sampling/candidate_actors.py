@@ -20,6 +20,9 @@ from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import distribution_of, extract_features
 from sb3_reinforce.policies.plain_mlp import plain_actor, temperature_hooks
 
+# Where the distribution of gSDE keeps its noise
+MATRICES = ("exploration_mat", "exploration_matrices")
+
 
 class LoopActor:
     """The policy's own ``predict``, in one environment after the other; a candidate is in it only while it predicts."""
@@ -44,6 +47,8 @@ class LoopActor:
     def act(self, obs: Any) -> np.ndarray:
         """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
         centre = to_vector(self.searched)
+        kind = vars(self.policy.action_dist)
+        noise: dict[str, Any] = {name: kind[name] for name in MATRICES if name in kind}
         actions = []
         try:
             for i, theta in enumerate(self.thetas):
@@ -55,6 +60,7 @@ class LoopActor:
                 actions.append(action)
         finally:
             parameters.write(self.searched, centre)
+            kind.update(noise)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 
 

@@ -66,8 +66,8 @@ def check_scale(env: VecEnv | None) -> None:
     learning = [each for each in normalizers(env) if each.training and each.norm_reward]
     if learning and env is not None and original_reward_of(env) is None:
         raise ValueError(
-            "VecNormalize must have norm_reward=False below a wrapper that may change rewards "
-            f"({type(env).__name__}): while candidates are compared its scale stands still"
+            "VecNormalize must have norm_reward=False, or training=False once its scale is learned, below a wrapper "
+            f"that may change rewards ({type(env).__name__}): while candidates are compared the scale stands still"
         )
 
 

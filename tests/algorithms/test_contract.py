@@ -35,7 +35,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.common import settings
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
-from sb3_reinforce.policies.evaluation import MIN_TEMPERATURE, floor_std
+from sb3_reinforce.policies.evaluation import MIN_TEMPERATURE
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
@@ -340,13 +340,19 @@ def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
     assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("min_std", [0.5, 5.0])
-def test_min_std_is_a_floor_where_the_deviation_is_no_exponential(min_std):
-    policy_kwargs = {"use_expln": True, "log_std_init": -3.0}
-    policy = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=policy_kwargs).policy
-    floor_std(policy, min_std)
-    stds = policy.action_dist.get_std(policy.log_std)
-    assert stds.min().item() == pytest.approx(min_std, rel=1e-4)
+def test_min_std_above_1_is_refused_where_the_deviation_is_no_exponential():
+    arguments = {"use_sde": True, "policy_kwargs": {"use_expln": True, "log_std_init": -3.0}}
+    policy = REINFORCE("MlpPolicy", "Pendulum-v1", min_std=0.5, **arguments).policy
+    assert policy.action_dist.get_std(policy.log_std).min().item() == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="min_std must be at most 1 with use_expln=True, got 5"):
+        REINFORCE("MlpPolicy", "Pendulum-v1", min_std=5.0, **arguments)
+
+
+def test_a_floor_that_a_callback_sets_at_the_start_of_a_rollout_holds_for_the_noise_of_gsde():
+    change = Record(lambda model: setattr(model, "min_std", 100.0), at="rollout_start")
+    arguments = {"use_sde": True, "sde_sample_freq": -1, "policy_kwargs": {"log_std_init": -3.0}}
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=64, seed=0, **arguments).learn(64, callback=change)
+    assert np.std(model.rollout_buffer.actions) > 10
 
 
 @pytest.mark.parametrize("force_reset", [True, False])

@@ -158,6 +158,57 @@ def test_a_new_policy_whose_last_layer_alone_learns_is_named():
     assert check_gradient(REINFORCE(HalfDetached, env, device="cpu", seed=0)).failures == ["scores"]
 
 
+class Stale(ActorCriticPolicy):
+    """Samples from the policy as it was made, and reports the present log π."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.first = None
+
+    def forward(self, obs, deterministic=False):
+        if self.first is None:
+            self.first = self.get_distribution(obs).distribution.logits[:1].detach()
+        actions = th.distributions.Categorical(logits=self.first.expand(len(obs), -1)).sample()
+        values, log_prob, _ = self.evaluate_actions(obs, actions)
+        return actions, values, log_prob
+
+
+class WithoutBias(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.action_net = th.nn.Linear(self.action_net.in_features, self.action_net.out_features, bias=False)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
+
+
+class OwnHead(ActorCriticPolicy):
+    """Its distribution comes from another layer."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.head = th.nn.Linear(self.action_net.in_features, self.action_net.out_features)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
+
+    def get_distribution(self, obs):
+        return self.action_dist.proba_distribution(
+            self.head(self.mlp_extractor.forward_actor(self.extract_features(obs)))
+        )
+
+    def forward(self, obs, deterministic=False):
+        distribution = self.get_distribution(obs)
+        actions = distribution.get_actions(deterministic)
+        return actions, self.predict_values(obs), distribution.log_prob(actions)
+
+    def evaluate_actions(self, obs, actions):
+        distribution = self.get_distribution(obs)
+        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+
+
+@pytest.mark.parametrize(("policy", "failures"), [(Stale, ["sign"]), (WithoutBias, []), (OwnHead, [])])
+def test_policies_with_other_heads_and_samples(policy, failures):
+    model = REINFORCE(policy, make_vec_env("CartPole-v1", 2, seed=0), device="cpu", seed=0)
+    assert check_gradient(model).failures == failures
+
+
 class WrongReturns(REINFORCE):
     """Forgets the discount factor of what is still to come."""
 
