@@ -38,7 +38,7 @@ MAX_LEARNING_RATE = 1e6
 MAX_SEED = 2**32 - 1
 # At this temperature float32 logits prefer no action
 MAX_TEMPERATURE = 1e6
-# Noise this strong drowns the mean
+# Noise this strong drowns a mean or a parameter
 MAX_STD = 1e6
 USE_RECURRENT = (
     "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
@@ -122,7 +122,7 @@ FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "estimator": check_name,
     "perturbation": check_name,
     "n_delta": optional(check_count),
-    "delta_std": optional(partial(CheckedSchedule, low=0, above=True)),
+    "delta_std": optional(partial(CheckedSchedule, low=0, above=True, high=MAX_STD)),
     "n_eval_episodes": check_count,
     "common_random_numbers": check_flag,
     "n_top": optional(check_count),
