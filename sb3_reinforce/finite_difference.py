@@ -215,7 +215,7 @@ class FiniteDifference(BasePolicyGradient):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
-        tb_log_name: str = "FiniteDifference",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfFiniteDifference:
@@ -225,7 +225,7 @@ class FiniteDifference(BasePolicyGradient):
         :param total_timesteps: Environment steps, of all environments together; the last update is finished
         :param callback: Called at each step of the environments; ``model.policy`` is then the centre θ
         :param log_interval: Updates between two entries of the log; None for no log
-        :param tb_log_name: The name of the run for tensorboard
+        :param tb_log_name: The name of the run for tensorboard; None for that of the class
         :param reset_num_timesteps: Whether to start the counts of steps and episodes from zero
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
@@ -235,7 +235,7 @@ class FiniteDifference(BasePolicyGradient):
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         self._check_arguments()
         n = self.n_parameters

@@ -1,6 +1,6 @@
 """REINFORCE with a memory, for tasks in which one observation does not say enough."""
 
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -22,8 +22,6 @@ from sb3_reinforce.sampling.columns import Columns
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
 __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
-
-SelfRecurrentREINFORCE = TypeVar("SelfRecurrentREINFORCE", bound="RecurrentREINFORCE")
 
 # What sb3-contrib's policies compute for one step, and what computes it for whole sequences
 SEQUENCE_METHODS = {
@@ -115,30 +113,6 @@ class RecurrentREINFORCE(REINFORCE):
                     f"{self.policy_class.__name__}"
                 )
         super()._setup_model()
-
-    def learn(
-        self: SelfRecurrentREINFORCE,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 10,
-        tb_log_name: str = "RecurrentREINFORCE",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfRecurrentREINFORCE:
-        """
-        Train as :meth:`REINFORCE.learn <sb3_reinforce.REINFORCE.learn>`, with a different name in the log.
-
-        :param total_timesteps: Environment steps, of all environments together; the last rollout is finished
-        :param callback: Called at each step of the environments
-        :param log_interval: Rollouts between two entries of the log; None for no log
-        :param tb_log_name: The name of the run for tensorboard
-        :param reset_num_timesteps: Whether to reset the count of steps, and the environments; whole episodes always
-            begin with a reset
-        :param progress_bar: Display a progress bar using tqdm and rich
-        :return: The trained model
-        :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
-        """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_actor", "_state"]

@@ -546,7 +546,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 10,
-        tb_log_name: str = "REINFORCE",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfREINFORCE:
@@ -556,7 +556,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param total_timesteps: Environment steps, of all environments together; the last rollout is finished
         :param callback: Called at each step of the environments
         :param log_interval: Rollouts between two entries of the log; None for no log
-        :param tb_log_name: The name of the run for tensorboard
+        :param tb_log_name: The name of the run for tensorboard; None for that of the class
         :param reset_num_timesteps: Whether to reset the count of steps, and the environments; whole episodes always
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
@@ -569,6 +569,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if not th.is_grad_enabled():
             raise ValueError("learn needs gradients, and PyTorch's are turned off: call th.set_grad_enabled(True)")
+        tb_log_name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

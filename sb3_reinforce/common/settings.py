@@ -133,7 +133,7 @@ LEARN_ARGUMENTS: dict[str, Check] = {
     "total_timesteps": partial(check_number, low=0),
     "callback": check_callback,
     "log_interval": optional(check_count),
-    "tb_log_name": partial(check_kind, kinds=(str,)),
+    "tb_log_name": optional(partial(check_kind, kinds=(str,))),
     "reset_num_timesteps": check_flag,
     "progress_bar": check_flag,
 }

@@ -1,6 +1,5 @@
 """RecurrentREINFORCE: exact gradients through whole episodes, V where they are cut, states that are carried on."""
 
-from inspect import signature
 from itertools import product
 
 import cloudpickle
@@ -352,9 +351,14 @@ def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
         call(make_vec_env("CartPole-v1"))
 
 
-@pytest.mark.parametrize("algorithm", [REINFORCE, RecurrentREINFORCE, FiniteDifference])
-def test_the_log_has_the_name_of_the_algorithm(algorithm):
-    assert signature(algorithm.learn).parameters["tb_log_name"].default == algorithm.__name__
+@pytest.mark.parametrize(
+    ("algorithm", "policy"),
+    [(REINFORCE, "MlpPolicy"), (RecurrentREINFORCE, "MlpLstmPolicy"), (FiniteDifference, "LinearPolicy")],
+)
+def test_the_log_has_the_name_of_the_algorithm_or_the_given_one(algorithm, policy, tmp_path):
+    model = algorithm(policy, "CartPole-v1", tensorboard_log=tmp_path, device="cpu").learn(1)
+    model.learn(1, tb_log_name="mine")
+    assert {path.name for path in tmp_path.iterdir()} == {f"{algorithm.__name__}_1", "mine_1"}
 
 
 def test_episodes_without_their_memory_are_reset():
