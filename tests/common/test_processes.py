@@ -274,7 +274,7 @@ def test_processes_with_other_arguments_are_refused(name, tmp_path):
 
 
 def actions_of_all(rank, path):
-    """With restored generators, with the same seed in all, and after a callback has changed the policy."""
+    """With restored generators, with the same seed in all, and after a callback has changed policy or temperature."""
     restored = KINDS["steps"][0].load(path, corridors(1), restore_random_state=True)
     restored.learn(1)
     seeded = make("steps", corridors(1), n_steps=32)
@@ -283,13 +283,19 @@ def actions_of_all(rank, path):
     changed = make("steps", corridors(1), n_steps=32)
     always_1 = th.tensor([-50.0, 50.0])
     changed.learn(128, Record(lambda model: model.policy.action_net.bias.data.copy_(always_1)))
-    return [model.rollout_buffer.actions[..., 0].T for model in (restored, seeded, changed)]
+    # From almost equal probabilities on, in the only rollout
+    cooled = make("steps", corridors(1), n_steps=32)
+    cooled.policy.action_net.bias.data.copy_(always_1 / 100)
+    cooled.learn(1, Record(lambda model: setattr(model, "temperature", 1e-3), "rollout_start"))
+    return [model.rollout_buffer.actions[..., 0].T for model in (restored, seeded, changed, cooled)]
 
 
 def test_processes_draw_other_actions_and_take_over_what_a_callback_changes(tmp_path):
     make("steps", corridors(1), n_steps=32, seed=0).save(tmp_path / "model")
-    (restored, seeded, changed), _ = in_processes(2, partial(actions_of_all, path=tmp_path / "model"), tmp_path)
-    assert (restored[0] != restored[1]).any() and (seeded[0] != seeded[1]).any() and (changed == 1).all()
+    answers, _ = in_processes(2, partial(actions_of_all, path=tmp_path / "model"), tmp_path)
+    restored, seeded, changed, cooled = answers
+    assert (restored[0] != restored[1]).any() and (seeded[0] != seeded[1]).any()
+    assert (changed == 1).all() and (cooled == 1).all()
 
 
 def observations_of_all(rank):
