@@ -556,7 +556,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param total_timesteps: Environment steps, of all environments together; the last rollout is finished
         :param callback: Called at each step of the environments
         :param log_interval: Rollouts between two entries of the log; None for no log
-        :param tb_log_name: The name of the run for tensorboard; None for that of the class
+        :param tb_log_name: The name of the run for tensorboard; None for the name of the class
         :param reset_num_timesteps: Whether to reset the count of steps, and the environments; whole episodes always
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich

@@ -239,7 +239,7 @@ def test_other_forms_of_a_reward_are_accepted(value, kind):
 
 
 class Spoiling(Wrapper):
-    """Makes a reward or an observation NaN in result number ``at``, of which the first is that of a reset."""
+    """Makes a reward or an observation NaN in result number ``at``, of which the first is the result of a reset."""
 
     def __init__(self, env, what, at):
         super().__init__(env)

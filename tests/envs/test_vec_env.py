@@ -35,7 +35,7 @@ both_modes = pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
 
 
 class Dicts(gym.ObservationWrapper):
-    """Observations in a dict, and infos with keys of its own, at resets too."""
+    """Observations in a dict, and infos with its keys, at resets too."""
 
     n_resets = 0
 

@@ -89,7 +89,7 @@ SLIGHT = {
 
 @pytest.mark.parametrize("change", [*CHANGES, *SLIGHT])
 def test_a_policy_that_the_user_has_changed_acts_as_it_evaluates(change):
-    """Otherwise the gradient would be that of another policy than the one that acts."""
+    """Otherwise the gradient would belong to another policy than the one that acts."""
     policy = make_policy(spaces.Discrete(2))
     obs = np.repeat(np.eye(5, dtype=np.float32)[:1], N_DRAWS, axis=0)
 

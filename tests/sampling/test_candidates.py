@@ -139,7 +139,7 @@ def test_stochastic_candidates_sample_the_policy(actions, temperature):
 
 
 class Counting(gym.Env):
-    """Ends after as many steps as its first action says; its observation is a random number of its own, and a 1."""
+    """Ends after as many steps as its first action says; its observation is a random number and a 1."""
 
     observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Box(0, 1, (1,))
 

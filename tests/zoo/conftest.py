@@ -1,4 +1,4 @@
-"""Tests of the Zoo's commands need the Zoo, which emits warnings of its own, as its dependencies do."""
+"""Tests of the Zoo's commands need the Zoo, which emits warnings, as its dependencies do."""
 
 from importlib.util import find_spec
 from pathlib import Path
