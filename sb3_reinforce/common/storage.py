@@ -9,7 +9,6 @@ import shutil
 import warnings
 import zipfile
 from collections.abc import Mapping
-from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
@@ -23,6 +22,8 @@ from sb3_reinforce.common.processes import is_leader
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 # The names in REINFORCE's parameters; FiniteDifference lacks the last
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
+# Flags of optimizers, which PyTorch fills in where the state of another version of it lacks them
+FLAGS = ("decoupled_weight_decay", "foreach", "fused", "maximize", "capturable", "differentiable")
 
 
 def write_whole(target: PathOrFile, content: bytes) -> None:
@@ -112,18 +113,31 @@ def check_finite_state(state: Any, infinite: set[str], name: str = "") -> None:
 
 
 def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) -> str:
-    """Return why a copy of the optimizer could not take a step from this state, "" if it can."""
-    trial, own_state = deepcopy((optimizer, dict(state)))
-    try:
-        trial.load_state_dict(own_state)
-        for group in trial.param_groups:
+    """Return why a state does not belong to this kind of optimizer and its parameters, "" if it does."""
+    own = optimizer.state_dict()
+    groups = state.get("param_groups", [])
+    if [len(group.get("params", ())) for group in groups] != [len(group["params"]) for group in own["param_groups"]]:
+        return "it has other groups of parameters"
+    for setting, value in own["param_groups"][0].items():
+        for group in groups:
+            if setting not in group:
+                if setting in FLAGS:
+                    continue
+                return f"it has no {setting}: it belongs to another optimizer"
+            if isinstance(value, (float, tuple)) and type(group[setting]) not in (type(value), list, int):
+                return f"its {setting} is {group[setting]!r}"
+    parameters = dict(enumerate(parameter for group in optimizer.param_groups for parameter in group["params"]))
+    for index, moments in state.get("state", {}).items():
+        if index not in parameters:
+            return f"it has a parameter {index!r} more"
+        shapes = {key: np.shape(value) for key, value in own["state"].get(index, {}).items()}
+        if not shapes and "fused" in optimizer.defaults:
             # A fused step goes through moments and parameter side by side, and would write beyond shorter moments
-            group["fused"] = False
-            for parameter in group["params"]:
-                parameter.grad = th.zeros_like(parameter)
-        trial.step()
-    except Exception as error:
-        return f"it belongs to another optimizer or to other parameters: a step from it raises {error!r}"
+            shapes = dict.fromkeys(moments, tuple(parameters[index].shape))
+        for key, shape in shapes.items():
+            if key not in moments or np.shape(moments[key]) not in ((), shape):
+                got = tuple(np.shape(moments.get(key)))
+                return f"its {key} of parameter {index} must have shape {shape}, got {got}"
     return ""
 
 
