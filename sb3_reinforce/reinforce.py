@@ -569,7 +569,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if not th.is_grad_enabled():
             raise ValueError("learn needs gradients, and PyTorch's are turned off: call th.set_grad_enabled(True)")
-        tb_log_name = tb_log_name or type(self).__name__
+        tb_log_name = type(self).__name__ if tb_log_name is None else tb_log_name
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

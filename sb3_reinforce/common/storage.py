@@ -9,6 +9,7 @@ import shutil
 import warnings
 import zipfile
 from collections.abc import Mapping
+from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
@@ -153,7 +154,8 @@ def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
     if reason:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
     else:
-        part.load_state_dict(state)
+        # Copies, or two models that one dict is given to would share their moments
+        part.load_state_dict(deepcopy(dict(state)))
 
 
 def generator_states(device: th.device) -> bytes:

@@ -355,10 +355,18 @@ def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
     ("algorithm", "policy"),
     [(REINFORCE, "MlpPolicy"), (RecurrentREINFORCE, "MlpLstmPolicy"), (FiniteDifference, "LinearPolicy")],
 )
-def test_the_log_has_the_name_of_the_algorithm_or_the_given_one(algorithm, policy, tmp_path):
-    model = algorithm(policy, "CartPole-v1", tensorboard_log=tmp_path, device="cpu").learn(1)
-    model.learn(1, tb_log_name="mine")
-    assert {path.name for path in tmp_path.iterdir()} == {f"{algorithm.__name__}_1", "mine_1"}
+def test_the_log_has_the_name_of_the_class_or_the_given_one(algorithm, policy, tmp_path):
+    own = type("Own", (algorithm,), {})
+    given = []
+
+    def keep_name(locals_, globals_):
+        given.append(locals_["tb_log_name"])
+
+    for each, kwargs in ((algorithm, {}), (own, {}), (own, {"tb_log_name": "mine"})):
+        each(policy, "CartPole-v1", tensorboard_log=tmp_path, device="cpu").learn(1, keep_name, **kwargs)
+    names = [algorithm.__name__, "Own", "mine"]
+    assert sorted({*given}) == sorted(names)
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}_1" for name in names}
 
 
 def test_episodes_without_their_memory_are_reset():

@@ -283,7 +283,7 @@ def actions_of_all(rank, path):
     changed = make("steps", corridors(1), n_steps=32)
     always_1 = th.tensor([-50.0, 50.0])
     changed.learn(128, Record(lambda model: model.policy.action_net.bias.data.copy_(always_1)))
-    # From almost equal probabilities on, in the only rollout
+    # From probabilities of 0.27 and 0.73 on, in the only rollout
     cooled = make("steps", corridors(1), n_steps=32)
     cooled.policy.action_net.bias.data.copy_(always_1 / 100)
     cooled.learn(1, Record(lambda model: setattr(model, "temperature", 1e-3), "rollout_start"))

@@ -252,8 +252,22 @@ def test_wrong_parameters_change_nothing_at_all(exact_match, wrong, kind):
     model.learn(64, reset_num_timesteps=False)
 
 
+class ScaledAdam(th.optim.Adam):
+    """Keeps a setting outside its groups, which copies of an optimizer lack."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.scale = 0.5
+
+    def step(self, closure=None):
+        for parameter in self.param_groups[0]["params"]:
+            if parameter.grad is not None:
+                parameter.grad *= self.scale
+        return super().step(closure)
+
+
 @both
-@pytest.mark.parametrize("optimizer", [RMSpropTFLike, th.optim.Adafactor, th.optim.SGD, th.optim.AdamW])
+@pytest.mark.parametrize("optimizer", [RMSpropTFLike, th.optim.Adafactor, th.optim.SGD, th.optim.AdamW, ScaledAdam])
 def test_the_states_of_other_optimizers_are_loaded(optimizer, kind, tmp_path):
     model = make(kind, Corridor(), policy_kwargs={"net_arch": [4], "optimizer_class": optimizer}).learn(32)
     model.save(tmp_path / "model")
@@ -293,6 +307,17 @@ def test_a_state_may_lack_flags_that_a_newer_pytorch_has(kind):
     other.set_parameters(states)
     assert plain(other.get_parameters()) == plain(model.get_parameters())
     other.learn(32)
+
+
+@both
+def test_parameters_of_another_model_are_copied(kind):
+    """Also the moments of its optimizers, which PyTorch takes as they are."""
+    first = make(kind, Corridor()).learn(32)
+    second = make(kind, Corridor())
+    second.set_parameters(first.get_parameters())
+    before = plain(first.get_parameters())
+    second.learn(64)
+    assert plain(first.get_parameters()) == before
 
 
 @both
