@@ -28,7 +28,7 @@ from sb3_reinforce.common.spaces import check_env, check_noise, shift_to_start
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
 # Arguments of Stable-Baselines3's ``load`` that are not stored in the model
-LOAD_ARGUMENTS = {"custom_objects", "print_system_info", "force_reset"}
+LOAD_ARGUMENTS = {"print_system_info", "force_reset"}
 
 
 class BasePolicyGradient(Distributed):
@@ -145,6 +145,7 @@ class BasePolicyGradient(Distributed):
         path: storage.PathOrFile,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
         *args: Any,
         restore_random_state: bool = False,
         **kwargs: Any,
@@ -155,6 +156,7 @@ class BasePolicyGradient(Distributed):
         :param path: The file
         :param env: The environment to continue in; None for prediction alone
         :param device: Device on which the model is loaded
+        :param custom_objects: Replaces saved attributes of these names, also those that cannot be unpickled
         :param args: Further arguments of ``load`` in Stable-Baselines3
         :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
             device) into the state in which they were when the model was saved. Training then continues as if it had
@@ -185,8 +187,9 @@ class BasePolicyGradient(Distributed):
             raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         if env is not None:
             env = check_env(env, verbose=0)
-        kwargs = storage.leave_open(saved, kwargs, None if env is None else getattr(env, "num_envs", 1))
-        model = super().load(path, env, device, *args, **kwargs)
+        n_envs = None if env is None else getattr(env, "num_envs", 1)
+        kwargs |= storage.left_open(saved, {**(custom_objects or {}), **kwargs}, n_envs)
+        model = super().load(path, env, device, custom_objects, *args, **kwargs)
         if restore_random_state:
             storage.restore_generators(model._random_state, model.device)
         elif kwargs.get("seed") is not None:
@@ -235,8 +238,7 @@ class BasePolicyGradient(Distributed):
             storage.check_archive(states, ("policy.pth",))
             _, states, _ = load_from_zip_file(states, device=device, load_data=False)
         own = storage.check_states(states, self._get_torch_save_params()[0], exact_match)
-        # A mask that a user's policy adds to its logits may well be infinite
-        storage.check_finite_state(own, infinite={f".policy.{name}" for name, _ in self.policy.named_buffers()})
+        storage.check_finite_state(own, storage.may_be_infinite(self.policy))
         before: Any = deepcopy(self.get_parameters())
         try:
             # The policy comes first, and with it a mismatch that is named by its parameters

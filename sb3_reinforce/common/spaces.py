@@ -17,7 +17,8 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
     """Make the environment if it is an id, and check its spaces and its number of copies."""
     vectorized = isinstance(env, gym.vector.VectorEnv)
-    if vectorized or not (isinstance(env, str) or hasattr(env, "observation_space")):
+    has_spaces = isinstance(getattr(env, "observation_space", None), spaces.Space) and not isinstance(env, type)
+    if vectorized or not (isinstance(env, str) or has_spaces):
         hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if vectorized else ""
         raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")
     made: GymEnv = maybe_make_env(env, verbose)

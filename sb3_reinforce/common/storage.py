@@ -78,12 +78,12 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
     return attributes
 
 
-def leave_open(saved: Mapping[str, Any], given: dict[str, Any], n_envs: int | None) -> dict[str, Any]:
-    """``given``, and None for what was chosen for the user, where arguments are given or ``n_envs`` is another."""
+def left_open(saved: Mapping[str, Any], given: Mapping[str, Any], n_envs: int | None) -> dict[str, None]:
+    """Return what is to be chosen again for the user, where arguments are given or ``n_envs`` is another."""
     if not given and n_envs in (None, saved.get("n_envs")):
-        return given
+        return {}
     chosen = saved.get("_chosen_defaults", {})
-    return {name: None for name, value in chosen.items() if saved.get(name) == value} | given
+    return {name: None for name, value in chosen.items() if saved.get(name) == value and name not in given}
 
 
 def check_states(states: Mapping[str, Any], names: list[str], exact_match: bool) -> dict[str, Any]:
@@ -99,6 +99,12 @@ def check_states(states: Mapping[str, Any], names: list[str], exact_match: bool)
         if not isinstance(state, Mapping):
             raise TypeError(f"load_path_or_dict[{name!r}] must be a dict, as of state_dict(), got {state!r}")
     return own
+
+
+def may_be_infinite(policy: th.nn.Module) -> set[str]:
+    """Names of what is not trained, such as a mask that a user's policy adds to its logits."""
+    trained = {name for name, each in policy.named_parameters(remove_duplicate=False) if each.requires_grad}
+    return {f".policy.{name}" for name in policy.state_dict().keys() - trained}
 
 
 def check_finite_state(state: Any, infinite: set[str], name: str = "") -> None:
@@ -150,7 +156,7 @@ def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
     reason = optimizer_mismatch(part, state)
     needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
     if reason and exact_match:
-        raise ValueError(f"{needed}, but {reason}")
+        raise ValueError(f"{needed}, but {reason}: set_parameters with exact_match=False leaves it out")
     if reason:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
     else:

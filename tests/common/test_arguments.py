@@ -4,6 +4,7 @@ from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from inspect import signature
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -408,6 +409,20 @@ def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
 
 
 @both
+@pytest.mark.parametrize(
+    "env",
+    [
+        type("Task", (gym.Env,), {"observation_space": spaces.Box(-1, 1, (3,)), "action_space": spaces.Discrete(2)}),
+        SimpleNamespace(observation_space="of another library", action_space="of another library"),
+    ],
+    ids=["class", "other library"],
+)
+def test_what_is_no_environment(env, kind):
+    with pytest.raises(TypeError, match=r"env must be a gymnasium.Env, a VecEnv or a registered id, got"):
+        make(kind, env)
+
+
+@both
 def test_a_policy_goes_with_its_observations(kind):
     with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
         make(kind, Corridor(), "MultiInputPolicy")
@@ -426,6 +441,9 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
     assert (loaded(2, n_episodes=4).n_steps, loaded(2, n_episodes=4).n_episodes) == (None, 4)
     # What the user gives stays, also where it is what would have been chosen
     assert loaded(2, n_steps=32, baseline="leave_one_out").n_steps == 32
+    assert loaded(20, custom_objects={"n_steps": 64}).n_steps == 64
+    given = REINFORCE.load(tmp_path / "model", None, "cpu", {"n_episodes": 4})
+    assert (given.n_steps, given.n_episodes) == (None, 4)
     changed = loaded(2)
     changed.baseline = "time_mean"
     changed.save(tmp_path / "model")

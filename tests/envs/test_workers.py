@@ -102,6 +102,33 @@ def test_environments_that_fail_together_can_be_closed(fault, workers):
     assert env.closed and not any(process.is_alive() for process in env.processes)
 
 
+class OneWorker(SubprocVecEnv):
+    """A user's class, with several environments behind one pipe."""
+
+    def __init__(self, env_fns):
+        super().__init__(env_fns[:1], start_method="fork")
+        self.envs = DummyVecEnv(env_fns)
+        self.num_envs = len(env_fns)
+
+    def step_async(self, actions):
+        self.envs.step_async(actions)
+
+    def step_wait(self):
+        return self.envs.step_wait()
+
+    def reset(self):
+        return self.envs.reset()
+
+
+@pytest.mark.parametrize("kind", ["episodes", "search"])
+def test_a_subclass_is_left_alone(kind):
+    env = OneWorker([Corridor] * 3)
+    try:
+        assert make(kind, env).learn(30).num_timesteps >= 30
+    finally:
+        env.close()
+
+
 class TwoArguments(Exception):
     """Cannot be unpickled: its message has only the first argument."""
 
