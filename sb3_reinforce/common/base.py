@@ -156,7 +156,7 @@ class BasePolicyGradient(Distributed):
         :param path: The file
         :param env: The environment to continue in; None for prediction alone
         :param device: Device on which the model is loaded
-        :param custom_objects: Replaces saved attributes of these names, also those that cannot be unpickled
+        :param custom_objects: What to use instead of saved attributes, by name; these are not unpickled
         :param args: Further arguments of ``load`` in Stable-Baselines3
         :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
             device) into the state in which they were when the model was saved. Training then continues as if it had
@@ -188,11 +188,12 @@ class BasePolicyGradient(Distributed):
         if env is not None:
             env = check_env(env, verbose=0)
         n_envs = None if env is None else getattr(env, "num_envs", 1)
-        kwargs |= storage.left_open(saved, {**(custom_objects or {}), **kwargs}, n_envs)
+        given = {**(custom_objects or {}), **kwargs}
+        kwargs |= storage.left_open(saved, given.keys() - LOAD_ARGUMENTS, n_envs)
         model = super().load(path, env, device, custom_objects, *args, **kwargs)
         if restore_random_state:
             storage.restore_generators(model._random_state, model.device)
-        elif kwargs.get("seed") is not None:
+        elif given.get("seed") is not None:
             # A generator that was saved continues from the seed before
             model.set_random_seed(model.seed)
         return model

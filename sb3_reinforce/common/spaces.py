@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
@@ -17,8 +18,7 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
     """Make the environment if it is an id, and check its spaces and its number of copies."""
     vectorized = isinstance(env, gym.vector.VectorEnv)
-    has_spaces = isinstance(getattr(env, "observation_space", None), spaces.Space) and not isinstance(env, type)
-    if vectorized or not (isinstance(env, str) or has_spaces):
+    if vectorized or not isinstance(env, (str, gym.Env, VecEnv)):
         hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if vectorized else ""
         raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")
     made: GymEnv = maybe_make_env(env, verbose)

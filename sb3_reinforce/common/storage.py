@@ -8,7 +8,7 @@ import random
 import shutil
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -78,8 +78,8 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
     return attributes
 
 
-def left_open(saved: Mapping[str, Any], given: Mapping[str, Any], n_envs: int | None) -> dict[str, None]:
-    """Return what is to be chosen again for the user, where arguments are given or ``n_envs`` is another."""
+def left_open(saved: Mapping[str, Any], given: Set[str], n_envs: int | None) -> dict[str, None]:
+    """Return what is to be chosen again for the user, where arguments are given or ``n_envs`` differs."""
     if not given and n_envs in (None, saved.get("n_envs")):
         return {}
     chosen = saved.get("_chosen_defaults", {})
@@ -103,8 +103,9 @@ def check_states(states: Mapping[str, Any], names: list[str], exact_match: bool)
 
 def may_be_infinite(policy: th.nn.Module) -> set[str]:
     """Names of what is not trained, such as a mask that a user's policy adds to its logits."""
-    trained = {name for name, each in policy.named_parameters(remove_duplicate=False) if each.requires_grad}
-    return {f".policy.{name}" for name in policy.state_dict().keys() - trained}
+    frozen = {name for name, each in policy.named_parameters(remove_duplicate=False) if not each.requires_grad}
+    buffers = {name for name, _ in policy.named_buffers(remove_duplicate=False)}
+    return {f".policy.{name}" for name in frozen | buffers}
 
 
 def check_finite_state(state: Any, infinite: set[str], name: str = "") -> None:
@@ -156,7 +157,7 @@ def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
     reason = optimizer_mismatch(part, state)
     needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
     if reason and exact_match:
-        raise ValueError(f"{needed}, but {reason}: set_parameters with exact_match=False leaves it out")
+        raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
     if reason:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
     else:

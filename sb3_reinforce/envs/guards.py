@@ -56,8 +56,8 @@ def guard(env: VecEnv | None) -> Iterator[None]:
     """Within the block, the environments below ``env`` and its wrappers are guarded."""
     base = None if env is None else env.unwrapped
     with ExitStack() as stack:
-        # A subclass may have several environments in a worker
-        if type(base) is SubprocVecEnv:
+        # A subclass may have several environments behind one pipe
+        if isinstance(base, SubprocVecEnv) and len(base.remotes) == base.num_envs:
             watch(base)
         # A user, or an outer learn(), may have replaced a method for stepping on this instance
         if type(base) is DummyVecEnv and {"step", "step_async", "step_wait", "reset"}.isdisjoint(vars(base)):

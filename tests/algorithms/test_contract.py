@@ -157,7 +157,7 @@ def test_a_callback_stops_training_at_the_very_step(kind):
     model = make(kind, make_vec_env(lambda: Corridor((4,)), 2))
 
     def stop(locals_, globals_):
-        assert locals_.keys() >= (LOCALS if kind == "search" else LOCALS_OF_A2C)
+        assert locals_.keys() >= (LOCALS | {"finished"} if kind == "search" else LOCALS_OF_A2C)
         return np.bool_(model.num_timesteps < 42)
 
     ends = Record(lambda model: None)

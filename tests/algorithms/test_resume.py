@@ -105,8 +105,8 @@ def test_a_new_seed_at_load_draws_other_numbers(kind, tmp_path):
     kwargs = {"common_random_numbers": True} if kind == "search" else {}
     make(kind, make_vec_env("CartPole-v1", 2), seed=0, **kwargs).learn(100).save(tmp_path / "model")
     ends = []
-    for seed in (1, 2, 2):
-        model = KINDS[kind][0].load(tmp_path / "model", env=make_vec_env("CartPole-v1", 2), seed=seed, device="cpu")
+    for kwargs in ({"seed": 1}, {"seed": 2}, {"custom_objects": {"seed": 2}}):
+        model = KINDS[kind][0].load(tmp_path / "model", env=make_vec_env("CartPole-v1", 2), device="cpu", **kwargs)
         ends.append(plain(model.learn(200).get_parameters()))
     assert ends[1] == ends[2] != ends[0]
 

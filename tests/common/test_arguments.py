@@ -413,7 +413,7 @@ def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
     "env",
     [
         type("Task", (gym.Env,), {"observation_space": spaces.Box(-1, 1, (3,)), "action_space": spaces.Discrete(2)}),
-        SimpleNamespace(observation_space="of another library", action_space="of another library"),
+        SimpleNamespace(observation_space=spaces.Box(-1, 1, (3,)), action_space=spaces.Discrete(2)),
     ],
     ids=["class", "other library"],
 )

@@ -25,8 +25,8 @@ def workers():
     """Starts workers; a watchdog kills them if a test hangs."""
     started = []
 
-    def start(env_fns, start_method="fork"):
-        started.append(SubprocVecEnv(env_fns, start_method=start_method))
+    def start(env_fns, start_method="fork", cls=SubprocVecEnv):
+        started.append(cls(env_fns, start_method=start_method))
         return started[-1]
 
     def kill():
@@ -72,6 +72,16 @@ def test_a_worker_that_dies_is_named(start_method, fault, end, kind, workers, tm
     model.save(tmp_path / "model")
     model.set_env(DummyVecEnv([Faulty] * 3))
     assert model.learn(32).num_timesteps >= 32
+
+
+class Own(SubprocVecEnv):
+    """A user's subclass."""
+
+
+def test_a_worker_of_a_subclass_dies(workers):
+    env = workers([Faulty, Faulty, lambda: Faulty("die in step", at=5)], cls=Own)
+    with pytest.raises(ConnectionError, match=f"environment 2 died: it {KILLED}"):
+        make("steps", env).learn(100)
 
 
 def test_the_only_worker_dies(workers):
@@ -121,7 +131,7 @@ class OneWorker(SubprocVecEnv):
 
 
 @pytest.mark.parametrize("kind", ["episodes", "search"])
-def test_a_subclass_is_left_alone(kind):
+def test_several_environments_behind_one_pipe(kind):
     env = OneWorker([Corridor] * 3)
     try:
         assert make(kind, env).learn(30).num_timesteps >= 30
