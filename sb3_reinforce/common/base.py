@@ -158,11 +158,10 @@ class BasePolicyGradient(Distributed):
         :param device: Device on which the model is loaded
         :param custom_objects: What to use instead of saved attributes, by name; these are not unpickled
         :param args: Further arguments of ``load`` in Stable-Baselines3
-        :param restore_random_state: Put the global generators of Python, NumPy and PyTorch (on the CPU and the model's
-            device) into the state in which they were when the model was saved. Training then continues as if it had
-            not been interrupted, from a reset of the environments on; the file has neither the environments' state and
-            generators nor the statistics of VecNormalize. Without it, a model with a seed seeds the generators again:
-            to seed them otherwise, do so after loading
+        :param restore_random_state: Restore the global generators of Python, NumPy and PyTorch (on the CPU and the
+            model's device) as they were saved. Training then continues as if it had not been interrupted, from a reset
+            of the environments on; the file has neither the environments' state and generators nor the statistics of
+            VecNormalize. Without it, a model with a seed seeds the generators again: seed them otherwise after loading
         :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones. An
             ``lr_schedule`` that was set by hand is not stored
         :return: The model
