@@ -208,10 +208,16 @@ def peers() -> str:
     return markdown(["", "REINFORCE's steps/s ÷ this one's", "steps to the return", "CPU seconds"], lines)
 
 
-def images() -> str:
+def images(device: str = "cpu") -> str:
     """Steps a second from images beside A2C, for each number of environments."""
-    texts = [f"{row['REINFORCE / A2C']:.2f}" for _, row in read("images").iterrows()]
-    return ", ".join(texts)
+    rows = read("images")
+    texts = [f"{ratio:.2f}" for ratio in rows.loc[rows["device"] == device, "REINFORCE / A2C"]]
+    return " and ".join(texts)
+
+
+def images_on_a_gpu() -> str:
+    """As ``images``, on an H100."""
+    return images("cuda")
 
 
 def processes() -> str:

@@ -1,0 +1,115 @@
+"""On a GPU a model learns as on the CPU, and can be saved there and loaded here. Skipped where there is no GPU."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.utils import set_random_seed
+from torch.distributions import normal
+
+from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines, compare_estimators, landscape
+from sb3_reinforce.recurrent import RecurrentREINFORCE
+
+pytestmark = [
+    pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU"),
+    pytest.mark.filterwarnings("ignore:You are trying to run:UserWarning"),
+]
+
+MULTI_INPUT = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
+KINDS: dict[str, tuple[type, str, Any, dict[str, Any]]] = {
+    "critic": (REINFORCE, "MlpPolicy", "CartPole-v1", {"n_steps": 64}),
+    "episodes": (REINFORCE, "MlpPolicy", "CartPole-v1", {"n_episodes": 6, "baseline": "leave_one_out"}),
+    "optimal": (REINFORCE, "MlpPolicy", "CartPole-v1", {"n_episodes": 6, "baseline": "optimal"}),
+    "scores": (REINFORCE, "MlpPolicy", "CartPole-v1", {"n_episodes": 6, "baseline": "none", "step": "natural"}),
+    "natural": (REINFORCE, "MlpPolicy", "Pendulum-v1", {"n_steps": 200, "step": "natural"}),
+    "gsde": (REINFORCE, "MlpPolicy", "Pendulum-v1", {"n_steps": 64, "use_sde": True}),
+    "images": (REINFORCE, "MultiInputPolicy", SimpleMultiObsEnv, {"n_steps": 32, "policy_kwargs": MULTI_INPUT}),
+    "natural images": (
+        REINFORCE,
+        "MultiInputPolicy",
+        SimpleMultiObsEnv,
+        {"n_steps": 32, "step": "natural", "policy_kwargs": {"share_features_extractor": False, **MULTI_INPUT}},
+    ),
+    "memory": (RecurrentREINFORCE, "MlpLstmPolicy", "CartPole-v1", {"n_steps": 64}),
+    "natural memory": (RecurrentREINFORCE, "MlpLstmPolicy", "Pendulum-v1", {"n_steps": 64, "step": "natural"}),
+    "search": (FiniteDifference, "MlpPolicy", "CartPole-v1", {"n_delta": 4, "estimator": "central"}),
+    "forward search": (FiniteDifference, "LinearPolicy", "Pendulum-v1", {"n_delta": 4, "estimator": "forward"}),
+}
+all_kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+def make(kind: str, device: str) -> Any:
+    algorithm, policy, env_id, arguments = KINDS[kind]
+    # Some environments draw from NumPy's generator when they are made
+    set_random_seed(0)
+    return algorithm(policy, make_vec_env(env_id, 2, seed=0), seed=0, device=device, **arguments)
+
+
+@pytest.fixture
+def same_numbers(monkeypatch):
+    """Both devices draw the same actions and noise, and convolve in float32, where a GPU would in TF32."""
+    monkeypatch.setattr(th.backends.cudnn, "allow_tf32", False)
+    multinomial, standard_normal = th.multinomial, normal._standard_normal
+
+    def on_the_cpu(probs, *args, **kwargs):
+        return multinomial(probs.cpu(), *args, **kwargs).to(probs.device)
+
+    def normal_on_the_cpu(shape, dtype, device):
+        return standard_normal(shape, dtype, "cpu").to(device)
+
+    monkeypatch.setattr(th, "multinomial", on_the_cpu)
+    monkeypatch.setattr(normal, "_standard_normal", normal_on_the_cpu)
+
+
+def parameters(model: Any) -> np.ndarray:
+    return np.concatenate([values.detach().cpu().numpy().ravel() for values in model.policy.state_dict().values()])
+
+
+@all_kinds
+def test_a_gpu_learns_as_the_cpu_does(kind, same_numbers):
+    models = [make(kind, device).learn(1) for device in ("cpu", "cuda")]
+    before = parameters(make(kind, "cpu"))
+    moved, on_the_gpu = [parameters(model) - before for model in models]
+    assert np.linalg.norm(moved) > 0
+    assert np.linalg.norm(on_the_gpu - moved) < 0.01 * np.linalg.norm(moved)
+    assert all(parameter.is_cuda for parameter in models[1].policy.parameters())
+
+
+@all_kinds
+def test_a_model_of_a_gpu_predicts_the_same_on_the_cpu(kind, tmp_path):
+    model = make(kind, "cuda").learn(1)
+    model.save(tmp_path / "model")
+    here = type(model).load(tmp_path / "model", device="cpu")
+    assert np.array_equal(parameters(here), parameters(model))
+    obs = model.get_env().reset()
+    actions = [each.predict(obs, deterministic=True)[0] for each in (here, model)]
+    np.testing.assert_allclose(actions[0], actions[1], atol=1e-4)
+    here.set_env(model.get_env())
+    here.learn(1, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("kind", ["critic", "scores", "natural", "memory", "search", "forward search"])
+def test_a_run_on_a_gpu_continues_as_if_it_had_not_stopped(kind, tmp_path):
+    model = make(kind, "cuda").learn(1)
+    model.save(tmp_path / "model")
+    ends = []
+    for is_resumed in (False, True):
+        if is_resumed:
+            model = type(model).load(tmp_path / "model", device="cuda", restore_random_state=True)
+        model.set_env(make_vec_env(KINDS[kind][2], 2, seed=1))
+        ends.append(parameters(model.learn(1, reset_num_timesteps=False)))
+    np.testing.assert_allclose(*ends, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["critic", "scores", "natural", "search"])
+def test_the_laboratory_measures_on_a_gpu(kind):
+    model = make(kind, "cuda")
+    assert np.isfinite(landscape(model, n_points=3, n_episodes=2).utilities).all()
+    compare_estimators(model, 8, 3, n_resamples=2)
+    if isinstance(model, REINFORCE):
+        compare_baselines(model, 8, n_resamples=2)
+        check_gradient(model)
