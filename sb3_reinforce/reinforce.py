@@ -444,7 +444,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
         if with_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
-            loss = loss + self.vf_coef * F.mse_loss(values, batch.returns)
+            loss = loss + self.vf_coef * F.mse_loss(values, batch.returns.to(values))
         grad_norm = kl = 0.0
         # An actor may be frozen while its critic warms up
         if actor and loss.requires_grad:

@@ -87,7 +87,9 @@ def fit_critic(
         for _ in range(n_updates):
             for batch in minibatches(policy, obs, len(returns), batch_size):
                 # L = mean_t (G_t − V(s_t))²
-                loss = F.mse_loss(value(batch).flatten(), returns[batch])
+                values = value(batch).flatten()
+                # A GPU does not differentiate the error between float64 and float32
+                loss = F.mse_loss(values, returns[batch].to(values))
                 gradients = th.autograd.grad(loss, parameters)
                 optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
                 losses.append(loss.detach())

@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from environments import Tree
+from gymnasium import spaces
+from models import Double, float64
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.utils import set_random_seed
@@ -65,6 +68,17 @@ def same_numbers(monkeypatch):
     monkeypatch.setattr(normal, "_standard_normal", normal_on_the_cpu)
 
 
+class DoubleLinear(Double):
+    """With parameters it is shared by actor and critic, and the policy step descends the critic's error too."""
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(observation_space)
+        self.linear = th.nn.Linear(self.features_dim, self.features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.linear(super().forward(observations))
+
+
 def parameters(model: Any) -> np.ndarray:
     return np.concatenate([values.detach().cpu().numpy().ravel() for values in model.policy.state_dict().values()])
 
@@ -77,6 +91,17 @@ def test_a_gpu_learns_as_the_cpu_does(kind, same_numbers):
     assert np.linalg.norm(moved) > 0
     assert np.linalg.norm(on_the_gpu - moved) < 0.01 * np.linalg.norm(moved)
     assert all(parameter.is_cuda for parameter in models[1].policy.parameters())
+
+
+@pytest.mark.parametrize("extractor", [Double, DoubleLinear])
+def test_a_critic_in_float64_learns(extractor):
+    with float64():
+        kwargs = {"features_extractor_class": extractor}
+        model = REINFORCE("MlpPolicy", Tree(), n_steps=16, device="cuda", policy_kwargs=kwargs)
+    before = model.policy.value_net.weight.clone()
+    model.learn(16)
+    assert before.dtype is th.float64
+    assert not th.equal(model.policy.value_net.weight, before)
 
 
 @all_kinds
