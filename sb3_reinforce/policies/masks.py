@@ -36,7 +36,8 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     An observation that is no dict becomes ``{"observation": ..., "action_mask": ...}``. The mask is an int8 array of
     shape ``(n,)``, 1 where an action is allowed: n is the number of actions for ``Discrete``, and for
     ``MultiDiscrete`` the sum of the numbers of each dimension, one dimension after the other. This is the contract of
-    sb3-contrib's ``MaskablePPO``, so its environments and its ``ActionMasker`` can be wrapped as they are.
+    sb3-contrib's ``MaskablePPO``, so its environments with these actions can be wrapped as they are, and so can its
+    ``ActionMasker``.
 
     ``MaskedPolicy`` obeys the mask; other policies take it for a feature. ``VecNormalize`` needs ``norm_obs_keys``,
     since a mask cannot be normalized, and frames are stacked below this wrapper, not by ``VecFrameStack``.

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
@@ -81,3 +83,14 @@ def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
     other = FiniteDifference("MlpPolicy", env_id, estimator="central", n_delta=1, seed=2)
     other.set_parameters(str(tmp_path / "model"), exact_match=False)
     assert th.equal(other.theta, search.theta)
+
+
+@pytest.mark.parametrize("algorithm", [A2C, PPO])
+def test_a_policy_moves_to_another_algorithm_and_back(algorithm: type[OnPolicyAlgorithm]) -> None:
+    model = REINFORCE("MlpPolicy", "CartPole-v1", seed=0)
+    other = algorithm("MlpPolicy", "CartPole-v1", seed=1, device="cpu")
+    other.set_parameters({"policy": model.get_parameters()["policy"]}, exact_match=False)
+    assert all(map(th.equal, other.policy.parameters(), model.policy.parameters()))
+    other.learn(1)
+    model.set_parameters(other.get_parameters(), exact_match=False)
+    assert all(map(th.equal, other.policy.parameters(), model.policy.parameters()))
