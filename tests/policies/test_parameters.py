@@ -85,6 +85,8 @@ def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
     assert th.equal(other.theta, search.theta)
 
 
+# A2C has another optimizer
+@pytest.mark.filterwarnings("ignore:load_path_or_dict:UserWarning")
 @pytest.mark.parametrize("algorithm", [A2C, PPO])
 def test_a_policy_moves_to_another_algorithm_and_back(algorithm: type[OnPolicyAlgorithm]) -> None:
     model = REINFORCE("MlpPolicy", "CartPole-v1", seed=0)
