@@ -138,7 +138,8 @@ class RecurrentREINFORCE(REINFORCE):
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:
             # Also where a callback fails at the end of the rollout, after which the episodes go on
-            if self._last_obs is None or n_rollout_steps is None:
+            # A callback may have changed n_steps since the call
+            if self._last_obs is None or self.n_steps is None:
                 self._next_state = None
             elif self._actor is not None:
                 self._next_state = self._state_after_rollout().cpu()

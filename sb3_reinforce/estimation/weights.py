@@ -89,11 +89,16 @@ def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_crit
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
     """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
+    return np.where(rollout.used.numpy(), differences(rollout, baseline), 0.0).astype(np.float32)
+
+
+def differences(rollout: Rollout, baseline: Any) -> Floats:
+    """``G_t − b_t``, shape ``(n_steps, n_envs)``, float64."""
     returns = rollout.returns.numpy()
-    advantages = returns - check_baseline(baseline, rollout)
+    found: Floats = returns - check_baseline(baseline, rollout)
     # Where all returns are equal, their mean differs by rounding, which a natural step would take for a gradient
-    advantages[np.abs(advantages) <= ROUNDING * np.abs(returns)] = 0.0
-    return np.where(rollout.used.numpy(), advantages, 0.0).astype(np.float32)
+    found[np.abs(found) <= ROUNDING * np.abs(returns)] = 0.0
+    return found
 
 
 def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:

@@ -151,27 +151,41 @@ def outputs_of(policy, episode):
     return logits[-1], float(values[-1])
 
 
+def set_n_steps(model):
+    """From the second rollout on."""
+    if model.num_timesteps > 0:
+        model.n_steps, model.n_episodes = 4, None
+
+
+def copy_of(buffer):
+    return buffer.episode_starts.copy(), buffer.log_probs.copy()
+
+
 @pytest.mark.parametrize("name", SPACES)
 @pytest.mark.parametrize("truncate", [False, True])
-@pytest.mark.parametrize("n_steps", [4, None])
+@pytest.mark.parametrize("n_steps", [4, None, "rollout_start", "rollout_end"])
 def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
-    """Also after time limits, and where a rollout cuts an episode that began in one before."""
+    """Also after time limits, where a rollout cuts an episode, and where a callback ends rollouts of whole episodes."""
+    switch = Record(set_n_steps, at=n_steps) if isinstance(n_steps, str) else Record(lambda model: None)
+    n_steps = None if isinstance(n_steps, str) else n_steps
     env = make_vec_env(lambda: Random(SPACES[name], lengths=(2, 5, 9), truncate=truncate), 2, seed=0)
     model = make_recurrent(name, env, n_steps=n_steps, n_episodes=None if n_steps else 4, learning_rate=0.0)
-    records = Record(lambda model: (model.rollout, model._last_obs, model.rollout_buffer.log_probs.copy()))
+    records = Record(lambda model: (model.rollout, model._last_obs, copy_of(model.rollout_buffer)))
     values = []
     evaluate_critic = model._evaluate_critic
     model._evaluate_critic = lambda *args: values.append(evaluate_critic(*args)) or values[-1]
     ends = Ends()
-    model.learn(40, [records, ends])
+    model.learn(60, [records, ends, switch])
     first = 0
     running = [[], []]
-    for (rollout, last_obs, log_probs), (own, own_next) in zip(records.records, values, strict=True):
+    for (rollout, last_obs, (starts, log_probs)), (own, own_next) in zip(records.records, values, strict=True):
         # The actor's steps and the sequences of training have one log π
         actions = rollout.actions.flatten().long()
         trained_on = log_prob_of(model.policy, flatten(rollout.inputs), actions)
         np.testing.assert_allclose(trained_on.detach(), log_probs.ravel(), atol=1e-6)
         for t, env in product(range(len(rollout.dones)), range(2)):
+            if starts[t, env]:
+                running[env] = []
             running[env].append(take(rollout.observations, (t, env)))
             logits, value = outputs_of(model.policy, running[env])
             assert own[t, env] == pytest.approx(value, abs=1e-6)
@@ -185,11 +199,7 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
             expected = 0.0 if following is None else outputs_of(model.policy, [*running[env], following])[1]
             if rollout.used[t, env]:
                 assert own_next[t, env] == pytest.approx(expected, abs=1e-6)
-            if is_last:
-                running[env] = []
         first += len(rollout.dones)
-        if n_steps is None:
-            running = [[], []]
 
 
 def test_the_default_rollouts():
@@ -369,18 +379,25 @@ def test_the_log_has_the_name_of_the_class_or_the_given_one(algorithm, policy, t
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}_1" for name in names}
 
 
+@pytest.mark.parametrize("at", ["rollout_start", "rollout_end"])
+def test_episodes_go_on_after_a_callback_has_set_n_steps(at):
+    env = make_vec_env(lambda: Corridor((3, 40)), 2, seed=0)
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=2, seed=0, device="cpu")
+    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].tolist())
+    model.learn(100, callback=[starts, Record(set_n_steps, at=at)])
+    assert all(starts.records[0])
+    assert not any(map(all, starts.records[2:]))
+
+
 def test_episodes_without_their_memory_are_reset():
     """A rollout of whole episodes keeps no states, and its last episodes are cut."""
-
-    def change(model):
-        model.n_steps = 5
-        model.n_episodes = None
-
     env = make_vec_env(lambda: Corridor((3, 7)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=3, seed=0, device="cpu")
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=3, seed=0, device="cpu").learn(1)
+    assert not all(model._last_episode_starts)
+    set_n_steps(model)
     starts = Record(lambda model: model.rollout_buffer.episode_starts[0].all())
-    model.learn(60, callback=[Record(change), starts])
-    assert starts.records[:2] == [True, True]
+    model.learn(40, starts, reset_num_timesteps=False)
+    assert starts.records[0]
     assert not all(starts.records)
 
 

@@ -51,6 +51,16 @@ def bandit(better=0.5, **kwargs):
     return model
 
 
+@pytest.mark.parametrize("n_episodes", [7, 10])
+def test_equal_returns_leave_no_gradient(n_episodes):
+    """Their mean differs from each by rounding."""
+    model = REINFORCE("MlpPolicy", make_vec_env(lambda: Corridor((5,)), 2, seed=0), gamma=0.99, device="cpu")
+    table = compare_baselines(model, n_episodes, baselines=["leave_one_out", "time_mean"])
+    rows = [table[name] for name in ("leave_one_out", "time_mean")]
+    assert [row.variance.value for row in rows] == [0.0, 0.0]
+    assert all(np.isnan(row.snr.value) for row in rows)
+
+
 @pytest.mark.parametrize("better", [0.5, 0.8, 0.2])
 def test_the_bandit_has_its_known_variances(better):
     """

@@ -49,6 +49,14 @@ def test_every_action_space_passes(action_space, kwargs):
     assert table.names == ["log_prob", "scores", "sign", "returns", "weights", "surrogate"]
 
 
+@pytest.mark.parametrize("baseline", ["leave_one_out", "time_mean", "mean"])
+def test_equal_returns_pass(baseline):
+    """Their mean differs from each by rounding."""
+    env = make_vec_env(lambda: Corridor((5,)), 2, seed=0)
+    model = REINFORCE("MlpPolicy", env, baseline=baseline, gamma=0.99, reward_to_go=baseline != "mean", device="cpu")
+    assert all(check_gradient(model, n_episodes=n).passed for n in range(3, 9))
+
+
 def two_episodes(env, policy="MlpPolicy", **kwargs):
     return partial(REINFORCE, policy, env, n_episodes=2, **kwargs)
 
