@@ -82,6 +82,7 @@ class RecurrentREINFORCE(REINFORCE):
     ):
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
+        self._are_whole = True
         super().__init__(
             policy, env, learning_rate, n_steps=n_steps, n_episodes=n_episodes, batch_size=batch_size, **kwargs
         )
@@ -131,20 +132,23 @@ class RecurrentREINFORCE(REINFORCE):
         :raises ValueError: As for :class:`~sb3_reinforce.REINFORCE`
         """
         self._actor = None
-        if self._next_state is None and not np.all(self._last_episode_starts):
-            # Whole episodes, whose states are not kept, came before: a callback has set n_steps
-            self._last_obs = None
         try:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:
             # Also where a callback fails at the end of the rollout, after which the episodes go on
-            # A callback may have changed n_steps since the call
-            if self._last_obs is None or self.n_steps is None:
+            if self._last_obs is None or self._are_whole:
                 self._next_state = None
             elif self._actor is not None:
                 self._next_state = self._state_after_rollout().cpu()
             # It cannot be pickled
             self._actor = None
+
+    def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
+        """Reset also episodes whose states were not kept: after whole ones the user or a callback may set n_steps."""
+        if self._next_state is None and not np.all(self._last_episode_starts):
+            self._last_obs = None
+        super()._start_episodes(env, are_whole)
+        self._are_whole = are_whole
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
         policy = cast(RecurrentPolicy, self.policy)

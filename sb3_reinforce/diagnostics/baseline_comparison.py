@@ -14,7 +14,7 @@ from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval,
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, parameters_of
-from sb3_reinforce.estimation.weights import differences
+from sb3_reinforce.estimation.weights import returns_minus_baseline
 from sb3_reinforce.reinforce import REINFORCE
 
 
@@ -143,7 +143,7 @@ def baseline_rows(
 
 def weights_by(baseline: Baseline, rollout: Rollout) -> th.Tensor:
     """``γ^t (G_t − b_t)`` with a baseline, shape ``(n_steps, n_envs)``, float64."""
-    return rollout.discounts * th.as_tensor(differences(rollout, baseline(rollout)))
+    return rollout.discounts * th.as_tensor(returns_minus_baseline(rollout, baseline(rollout)))
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:

@@ -89,10 +89,10 @@ def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_crit
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
     """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
-    return np.where(rollout.used.numpy(), differences(rollout, baseline), 0.0).astype(np.float32)
+    return np.where(rollout.used.numpy(), returns_minus_baseline(rollout, baseline), 0.0).astype(np.float32)
 
 
-def differences(rollout: Rollout, baseline: Any) -> Floats:
+def returns_minus_baseline(rollout: Rollout, baseline: Any) -> Floats:
     """``G_t − b_t``, shape ``(n_steps, n_envs)``, float64."""
     returns = rollout.returns.numpy()
     found: Floats = returns - check_baseline(baseline, rollout)

@@ -379,14 +379,29 @@ def test_the_log_has_the_name_of_the_class_or_the_given_one(algorithm, policy, t
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}_1" for name in names}
 
 
-@pytest.mark.parametrize("at", ["rollout_start", "rollout_end"])
+@pytest.mark.parametrize("at", ["rollout_start", "step", "rollout_end"])
 def test_episodes_go_on_after_a_callback_has_set_n_steps(at):
+    """The first rollout of fixed length begins with a reset, and no other one."""
     env = make_vec_env(lambda: Corridor((3, 40)), 2, seed=0)
     model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=2, seed=0, device="cpu")
     starts = Record(lambda model: model.rollout_buffer.episode_starts[0].tolist())
     model.learn(100, callback=[starts, Record(set_n_steps, at=at)])
-    assert all(starts.records[0])
+    assert all(starts.records[1])
     assert not any(map(all, starts.records[2:]))
+
+
+def test_episodes_go_on_after_an_error_at_the_start_of_a_rollout():
+    def fail(model):
+        if model.num_timesteps > 0:
+            model.n_steps, model.n_episodes = None, -1
+
+    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=4, seed=0, device="cpu")
+    with pytest.raises(ValueError, match="n_episodes"):
+        model.learn(100, Record(fail, at="rollout_start"))
+    model.n_steps, model.n_episodes = 4, None
+    model.learn(8, reset_num_timesteps=False)
+    assert not model.rollout_buffer.episode_starts[0].any()
 
 
 def test_episodes_without_their_memory_are_reset():
