@@ -11,7 +11,6 @@ from models import Double, float64
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.utils import set_random_seed
-from torch.distributions import normal
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines, compare_estimators, landscape
@@ -56,16 +55,16 @@ def make(kind: str, device: str) -> Any:
 def same_numbers(monkeypatch):
     """Both devices draw the same actions and noise; cuDNN takes float32, where it would take TF32."""
     monkeypatch.setattr(th.backends.cudnn, "allow_tf32", False)
-    multinomial, standard_normal = th.multinomial, normal._standard_normal
+    multinomial = th.multinomial
 
-    def on_the_cpu(probs, *args, **kwargs):
+    def multinomial_on_the_cpu(probs, *args, **kwargs):
         return multinomial(probs.cpu(), *args, **kwargs).to(probs.device)
 
-    def normal_on_the_cpu(shape, dtype, device):
-        return standard_normal(shape, dtype, "cpu").to(device)
+    def normal_on_the_cpu(self, sample_shape=()):
+        return self.loc + self.scale * th.randn(*sample_shape, *self.loc.shape).to(self.loc)
 
-    monkeypatch.setattr(th, "multinomial", on_the_cpu)
-    monkeypatch.setattr(normal, "_standard_normal", normal_on_the_cpu)
+    monkeypatch.setattr(th, "multinomial", multinomial_on_the_cpu)
+    monkeypatch.setattr(th.distributions.Normal, "rsample", normal_on_the_cpu)
 
 
 class DoubleLinear(Double):
