@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import set_random_seed
 
+from sb3_reinforce.common.moments import normalizers, observation_moments, seen_since
 from sb3_reinforce.common.processes import Finished, Processes, is_leader, rank_and_size
 from sb3_reinforce.common.settings import ATTRIBUTES
 
@@ -101,12 +102,9 @@ class Distributed(BaseAlgorithm):
         cast(Processes, self._processes).state = state
 
     def _moments(self) -> list[RunningMeanStd]:
-        """The statistics of a VecNormalize, in a fixed order."""
-        vec_normalize = self.get_vec_normalize_env()
-        if vec_normalize is None:
-            return []
-        of_obs = vec_normalize.obs_rms if vec_normalize.norm_obs else {}
-        return [*(of_obs.values() if isinstance(of_obs, dict) else [of_obs]), vec_normalize.ret_rms]
+        """The statistics of each VecNormalize, in a fixed order."""
+        stack = normalizers(self.env)
+        return [moments for each in stack for moments in (*observation_moments(each).values(), each.ret_rms)]
 
     def share_of(self, n_episodes: int) -> int:
         """How many episodes this process plays: the quotas of all W·n environments differ by at most 1."""
@@ -146,9 +144,10 @@ class Distributed(BaseAlgorithm):
             all_waited += waited
         for own, *others in zip(*buffers, strict=True):
             # In turns from the last on, or the last process would fill the window
-            turns = [*zip_longest(*map(reversed, [own, *others]))]
+            turns = zip_longest(*map(reversed, [own, *others]))
+            newest_first = [each for turn in turns for each in turn if each is not None]
             own.clear()
-            own.extend(each for turn in reversed(turns) for each in reversed(turn) if each is not None)
+            own.extend(reversed(newest_first))
         self.logger.record("time/wait_fraction", all_waited / (elapsed * processes.size))
         return parts
 
@@ -180,16 +179,3 @@ class Distributed(BaseAlgorithm):
     def collect_part(self, callback: BaseCallback) -> None:
         """Collect this process's part of a rollout."""
         raise NotImplementedError
-
-
-def seen_since(before: RunningMeanStd, after: RunningMeanStd) -> RunningMeanStd:
-    """The moments of what was observed in between: n E[x − m] and n E[(x − m)²] add up, where m is the mean before."""
-    seen = RunningMeanStd(0.0, after.mean.shape)
-    seen.count = after.count - before.count
-    if seen.count > 0:
-        shift = after.mean - before.mean
-        first = after.count * shift / seen.count
-        second = (after.count * (after.var + shift**2) - before.count * before.var) / seen.count
-        seen.mean = before.mean + first
-        seen.var = second - first**2
-    return seen

@@ -18,9 +18,13 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-KEEP_REWARDS = (VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage, VecVideoRecorder)
-# A subclass may have another one
-METHODS = [wrapper.step_wait for wrapper in KEEP_REWARDS]
+from sb3_reinforce.common.moments import normalizers, observation_moments
+
+# By the method, since a subclass may have another one
+KEEP_REWARDS = {
+    wrapper.step_wait
+    for wrapper in (VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage, VecVideoRecorder)
+}
 
 
 class ObservationStatistics:
@@ -28,8 +32,7 @@ class ObservationStatistics:
 
     def __init__(self, vec_normalize: VecNormalize):
         self.vec_normalize = vec_normalize
-        totals = vec_normalize.obs_rms if vec_normalize.norm_obs else {}
-        self.totals = totals if isinstance(totals, dict) else {"": totals}
+        self.totals = observation_moments(vec_normalize)
         # No observation counts here yet, not even the pseudo-observations with which a VecNormalize starts
         self.seen = {key: RunningMeanStd(0.0, total.mean.shape) for key, total in self.totals.items()}
 
@@ -41,20 +44,10 @@ class ObservationStatistics:
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
 
-def normalizers(env: VecEnv | None) -> list[VecNormalize]:
-    """All VecNormalize of a stack of wrappers, the outermost first."""
-    found = []
-    while isinstance(env, VecEnvWrapper):
-        if isinstance(env, VecNormalize):
-            found.append(env)
-        env = env.venv
-    return found
-
-
 def original_reward_of(env: VecEnv) -> Callable[[], np.ndarray] | None:
     """The method for the rewards below VecNormalize; None without one, or where a wrapper above it may change them."""
     found = None
-    while isinstance(env, VecNormalize) or (isinstance(env, KEEP_REWARDS) and type(env).step_wait in METHODS):
+    while isinstance(env, VecNormalize) or type(env).step_wait in KEEP_REWARDS:
         if isinstance(env, VecNormalize) and env.norm_reward:
             found = env.get_original_reward
         env = cast(VecEnvWrapper, env).venv
