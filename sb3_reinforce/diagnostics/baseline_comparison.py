@@ -110,8 +110,7 @@ def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -
                 "'value' out, or train a model with baseline='value'"
             )
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
-        rows = {"floor": None, **functions}
-        if rows.get(name, function) is not function:
+        if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(f"baselines must have names that differ, and {name!r} is the name of another row")
         functions[name] = function
     return functions
@@ -143,7 +142,7 @@ def baseline_rows(
 
 def weights_by(baseline: Baseline, rollout: Rollout) -> th.Tensor:
     """``γ^t (G_t − b_t)`` with a baseline, shape ``(n_steps, n_envs)``, float64."""
-    return rollout.discounts * th.as_tensor(returns_minus_baseline(rollout, baseline(rollout)))
+    return rollout.discounts * returns_minus_baseline(rollout, baseline(rollout))
 
 
 def relative_bias(baseline: Baseline, rollout: Rollout) -> float:

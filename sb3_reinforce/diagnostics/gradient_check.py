@@ -21,7 +21,7 @@ from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
-from sb3_reinforce.estimation.weights import by_step
+from sb3_reinforce.estimation.weights import by_step, returns_minus_baseline
 from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
@@ -117,6 +117,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     with undisturbed(model):
         rollout = collect_episodes(collector)
     policy = rollout.policy
+    # An error where log π cannot be differentiated
     parameters_of(rollout)
     obs, actions = used_inputs(rollout)
     some_obs, some_actions = spread(policy, obs, actions)
@@ -168,9 +169,7 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
     """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
     baseline = check_function("baseline", collector.baseline, BASELINES)
-    expected = (rollout.returns - baseline(rollout).cpu()) * rollout.used
-    # Equal returns differ from their mean by rounding
-    expected[expected.abs() <= 1e-12 * rollout.returns.abs()] = 0.0
+    expected = rollout.used * returns_minus_baseline(rollout, baseline(rollout))
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
 
 

@@ -16,7 +16,7 @@ from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamp
 from sb3_reinforce.envs.starts import check_groups
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
-from sb3_reinforce.estimation.weights import ROUNDING
+from sb3_reinforce.estimation.weights import without_rounding
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import start_from, undisturbed
 
@@ -130,8 +130,7 @@ def group_grams(rollouts: list[Rollout], returns: th.Tensor, used: th.Tensor) ->
         groups = (*returns.shape[:2], -1, m)
         baselines[m] = mean_of_others(returns.reshape(groups), used.reshape(groups), dim=3).reshape(returns.shape)
     residuals = (returns - th.stack(list(baselines.values()))) * used
-    # Equal returns differ from their mean by rounding
-    weights = th.where(residuals.abs() > ROUNDING * returns.abs().max(), residuals, 0.0).flatten(2)
+    weights = without_rounding(residuals, returns.abs().max()).flatten(2)
     blocks = []
     for rollout, own in zip(rollouts, weights.chunk(len(rollouts), dim=2), strict=True):
         w = rollout.discounts * own[:, : len(rollout.dones)]
@@ -153,8 +152,7 @@ def share_between(returns: th.Tensor, counts: th.Tensor) -> th.Tensor:
 
     The means of k episodes vary by ``σ²_between + σ²_within / k`` (Searle, Casella and McCulloch, 1992, chapter 3).
     """
-    centred = returns - returns.mean()
-    centred = th.where(centred.abs() > ROUNDING * returns.abs().max(), centred, 0.0)
+    centred = without_rounding(returns - returns.mean(), returns.abs().max())
     means = centred.mean(1)
     within = counts @ centred.var(1) / counts.sum(1)
     between = (variance(compute_moments(means[:, None] * means, counts)) - within / returns.shape[1]).clamp(min=0)

@@ -11,16 +11,17 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import select
-from sb3_reinforce.estimation.returns import Bools, Floats, Integers, reward_to_go, total_return
+from sb3_reinforce.estimation.returns import Bools, Floats, Integers
 from sb3_reinforce.policies.sequences import RecurrentPolicy, episode_numbers, rows_of
 
 
 @dataclass(frozen=True)
 class Rollout:
     """
-    A rollout with its returns, as a baseline sees it. The shape of every tensor starts with ``(n_steps, n_envs)``.
+    A rollout with its returns, as a baseline sees it.
 
-    Observations and actions are on the policy's device, all else on the CPU.
+    The shape of every tensor but ``state`` starts with ``(n_steps, n_envs)``. Observations, actions and ``state`` are
+    on the policy's device, all else on the CPU.
 
     :param observations: s_t, a tensor or a dict of tensors
     :param actions: a_t as the policy drew them, shape ``(n_steps, n_envs, action_dim)``
@@ -113,8 +114,9 @@ class Running:
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
         timesteps = timesteps_of(dones, self.timesteps)
-        earned = total_return(reward_to_go(rewards, dones, gamma), timesteps, gamma, self.rewards)
-        return Running(np.where(dones[-1], 0, timesteps[-1] + 1), np.where(dones[-1], 0.0, earned[-1]))
+        runs_on = ~in_finished_episode(dones)
+        earned = runs_on[0] * self.rewards + (runs_on * gamma**timesteps * rewards).sum(axis=0)
+        return Running(np.where(dones[-1], 0, timesteps[-1] + 1), earned)
 
 
 def within_quota(dones: Bools, quota: Integers) -> Bools:

@@ -89,16 +89,17 @@ def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_crit
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
     """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
-    return np.where(rollout.used.numpy(), returns_minus_baseline(rollout, baseline), 0.0).astype(np.float32)
+    return (rollout.used * returns_minus_baseline(rollout, baseline)).float().numpy()
 
 
-def returns_minus_baseline(rollout: Rollout, baseline: Any) -> Floats:
+def returns_minus_baseline(rollout: Rollout, baseline: Any) -> th.Tensor:
     """``G_t − b_t``, shape ``(n_steps, n_envs)``, float64."""
-    returns = rollout.returns.numpy()
-    found: Floats = returns - check_baseline(baseline, rollout)
-    # Where all returns are equal, their mean differs by rounding, which a natural step would take for a gradient
-    found[np.abs(found) <= ROUNDING * np.abs(returns)] = 0.0
-    return found
+    return without_rounding(rollout.returns - check_baseline(baseline, rollout), rollout.returns)
+
+
+def without_rounding(differences: th.Tensor, numbers: th.Tensor) -> th.Tensor:
+    """Differences of numbers, 0 where they are rounding errors, which a natural step would take for a gradient."""
+    return differences.masked_fill(differences.abs() <= ROUNDING * numbers.abs(), 0.0)
 
 
 def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:
@@ -172,8 +173,8 @@ def check_used(used: Bools) -> None:
         )
 
 
-def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
-    """b_t as an array, float64; an error unless it is a tensor of shape ``(n_steps, n_envs)``, finite at used steps."""
+def check_baseline(baseline: Any, rollout: Rollout) -> th.Tensor:
+    """b_t, float64, on the CPU; an error unless it is a tensor of shape ``(n_steps, n_envs)``, finite at used steps."""
     if not isinstance(baseline, th.Tensor):
         raise TypeError(f"baseline must return a tensor, got {type(baseline).__name__}")
     if baseline.shape != rollout.returns.shape:
@@ -181,6 +182,6 @@ def check_baseline(baseline: Any, rollout: Rollout) -> Floats:
             f"baseline must return a tensor of shape (n_steps, n_envs) = {tuple(rollout.returns.shape)}, got "
             f"{tuple(baseline.shape)}"
         )
-    values: Floats = np.where(rollout.used.numpy(), baseline.detach().cpu().double().numpy(), 0.0)
+    values = th.where(rollout.used, baseline.detach().cpu().double(), 0.0)
     check_finite("The baseline", values)
     return values
