@@ -449,7 +449,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         # An actor may be frozen while its critic warms up
         if actor and loss.requires_grad:
             gradients = th.autograd.grad(loss, actor, allow_unused=True)
+            # Divergences are those of the policy that acts: dropout and batch normalization in evaluation mode
+            self.policy.set_training_mode(False)
             grad_norm, kl = self._step_policy(route, batch, actor, gradients, log_prob.detach())
+            self.policy.set_training_mode(True)
         # A model that is saved now will be loaded with the temperature of the progress made
         self._apply_temperature_and_floor()
         self._n_updates += 1
@@ -470,11 +473,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """Step against the gradients; return their norm and the divergence. ``log_prob`` is log π before the step."""
         if self.step == "natural":
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
-            # The divergence is one of the policy that acts
-            self.policy.set_training_mode(False)
             check_distribution(self.policy, batch.observations, batch.actions, log_prob)
             grad_norm, kl = natural_step(self.policy, batch.observations, actor, gradients, target_kl)
-            self.policy.set_training_mode(True)
         else:
             obs, actions = batch.observations, batch.actions
             if route.actor is None:

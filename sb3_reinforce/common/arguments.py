@@ -4,7 +4,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from inspect import signature
+from inspect import Parameter, signature
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
@@ -144,9 +144,10 @@ def choose(model: Any, name: str, value: int) -> None:
     model._chosen_defaults[name] = value
 
 
-def own_arguments(cls: type, base: type) -> set[str]:
+def own_arguments(cls: type, base: type) -> dict[str, Parameter]:
     """The arguments of a class and of what it extends below ``base``, but for the environment and private ones."""
-    classes = cls.__mro__[: cls.__mro__.index(base)]
+    classes = reversed(cls.__mro__[: cls.__mro__.index(base)])
     arguments = [each for one in classes for each in signature(one.__init__).parameters.values()]  # type: ignore[misc]
-    named = {each.name for each in arguments if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
-    return {name for name in named - {"self", "env"} if not name.startswith("_")}
+    variadic = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+    named = [each for each in arguments if each.kind not in variadic and not each.name.startswith("_")]
+    return {each.name: each for each in named if each.name not in ("self", "env")}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
-from inspect import signature
 from io import BytesIO
 from typing import Any, ClassVar, TypeVar
 
@@ -44,7 +43,7 @@ class BasePolicyGradient(Distributed):
 
     def __new__(cls: type[Model], *args: Any, **kwargs: Any) -> Model:
         # Where Python would only say that an argument is unexpected; a subclass may have it
-        accepted = {name for each in cls.__mro__ for name in signature(each.__init__).parameters}  # type: ignore[misc]
+        accepted = own_arguments(cls, BasePolicyGradient)
         for name, instead in cls._instead.items():
             if name in kwargs and name not in accepted:
                 raise TypeError(f"{cls.__name__} has no argument {name}: {instead}")
@@ -176,7 +175,7 @@ class BasePolicyGradient(Distributed):
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
                 "call set_parameters with this path and exact_match=False"
             )
-        arguments = own_arguments(cls, BasePolicyGradient) - ATTRIBUTES.keys()
+        arguments = own_arguments(cls, BasePolicyGradient).keys() - ATTRIBUTES.keys()
         unknown = sorted(kwargs.keys() - arguments - saved.keys() - LOAD_ARGUMENTS)
         if unknown:
             raise TypeError(

@@ -164,17 +164,10 @@ def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple
 
 
 def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
-    """log π(a|s) of the policy that acts: dropout and batch normalization are in evaluation mode."""
-    is_training = policy.training and route.actor is None
-    if is_training:
-        policy.set_training_mode(False)
-    try:
-        # A user's evaluate_actions may differentiate
-        with th.set_grad_enabled(route.evaluate_actions):
-            return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
-    finally:
-        if is_training:
-            policy.set_training_mode(True)
+    """log π(a|s) of the policy that acts, which is in evaluation mode."""
+    # A user's evaluate_actions may differentiate
+    with th.set_grad_enabled(route.evaluate_actions):
+        return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
 
 
 def split_parameters(

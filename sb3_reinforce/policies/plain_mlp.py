@@ -89,13 +89,9 @@ def overrides(policy: ActorCriticPolicy, *methods: str) -> bool:
 
 def is_unchanged(thing: Any) -> bool:
     """Whether neither a method is replaced on an instance nor a hook registered, except for the temperature."""
-    attributes = vars(thing)
     cls: Any = type(thing)
-    if not methods_of(cls).isdisjoint(attributes):
-        return False
-    if not isinstance(thing, nn.Module) or not any(map(attributes.get, HOOKS)):
-        return True
-    return all(isinstance(hook, DivideLogits) for hook in hooks_of(thing))
+    hooks = hooks_of(thing) if isinstance(thing, nn.Module) else []
+    return methods_of(cls).isdisjoint(vars(thing)) and all(isinstance(hook, DivideLogits) for hook in hooks)
 
 
 def plain_actor(policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = ActorCriticPolicy) -> list[nn.Module] | None:

@@ -18,7 +18,7 @@ from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import distribution_of, extract_features
-from sb3_reinforce.policies.plain_mlp import plain_actor, temperature_hooks
+from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
 # Where the distribution of gSDE keeps its noise
 MATRICES = ("exploration_mat", "exploration_matrices")
@@ -80,7 +80,7 @@ class MatrixActor:
         self.deterministic = deterministic
         self.device = policy.device
         self.as_env_actions = env_actions_of(policy)
-        self.temperatures = [hook.temperature for hook in temperature_hooks(layers[-1])]
+        self.head = layers[-1]
 
         def stacked(parameter: th.Tensor) -> th.Tensor:
             """The values for each environment, matrices transposed in memory, which halves the price of a product."""
@@ -118,9 +118,7 @@ class MatrixActor:
                 x = th.baddbmm(bias, x, weight)
             else:
                 x = operation(x)
-        for temperature in self.temperatures:
-            x = x / temperature
-        return x[:, 0]
+        return apply_temperature(self.head, x)[:, 0]
 
 
 # Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters

@@ -1,7 +1,6 @@
 """Experiments of the RL Zoo with the algorithms of this package: their settings are found, checked and converted."""
 
 import importlib
-import inspect
 import re
 import runpy
 from collections import OrderedDict
@@ -18,7 +17,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_reinforce.common.arguments import check_integer, check_number, unknown_name
+from sb3_reinforce.common.arguments import check_integer, check_number, own_arguments, unknown_name
+from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.reinforce import REINFORCE
@@ -35,7 +35,7 @@ ZOO_KEYS = {
     "n_timesteps", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack", "env_kwargs",
     "monitor_kwargs",
 }  # fmt: skip
-ZOO_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model", "kwargs"}
+ZOO_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device"}
 # In a configuration, a section by environment: the entries keep to the keys of the Zoo and the arguments of the
 # algorithm, so that other scripts can read them
 TRAIN_ENV_KWARGS = "train_env_kwargs"
@@ -179,20 +179,15 @@ def fit_default(default: Settings, experiment: Experiment) -> Settings:
     return fitted
 
 
-def arguments_of(algorithm: str) -> dict[str, inspect.Parameter]:
-    """The arguments of an algorithm, with those that it hands on to the one that it extends."""
-    algorithms = [cls for cls in reversed(ALGORITHMS[algorithm].__mro__) if cls in ALGORITHMS.values()]
-    return {name: each for cls in algorithms for name, each in inspect.signature(cls).parameters.items()}
-
-
 def allowed_keys(algorithm: str) -> set[str]:
     """The keys that an algorithm's entry in a configuration may have."""
-    return arguments_of(algorithm).keys() - ZOO_ARGUMENTS | ZOO_KEYS | {TRAIN_ENV_KWARGS}
+    arguments = own_arguments(ALGORITHMS[algorithm], BasePolicyGradient)
+    return arguments.keys() - ZOO_ARGUMENTS | ZOO_KEYS | {TRAIN_ENV_KWARGS}
 
 
 def scheduled_keys(algorithm: str) -> set[str]:
     """The arguments of an algorithm that may be schedules."""
-    arguments = arguments_of(algorithm)
+    arguments = own_arguments(ALGORITHMS[algorithm], BasePolicyGradient)
     return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
 
 
