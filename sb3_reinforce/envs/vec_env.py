@@ -110,6 +110,13 @@ class GymnasiumVecEnv(VecEnv):
             values = [getattr(self.env, attr_name)] * self.num_envs
         return [values[i] for i in self._get_indices(indices)]
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether the copies have an attribute."""
+        if isinstance(self.env.unwrapped, AsyncVectorEnv):
+            # Gymnasium closes processes that are asked for an attribute that they lack
+            return all(self.env.unwrapped.call("has_wrapper_attr", attr_name))
+        return super().has_attr(attr_name)
+
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all copies; ``indices`` must be None or name all of them."""
         if len(list(self._get_indices(indices))) != self.num_envs:
@@ -136,14 +143,18 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Whether each copy is wrapped in a ``wrapper_class``."""
-        wanted = self._get_indices(indices)
-        return [self.copies is not None and is_wrapped(self.copies[i], wrapper_class) for i in wanted]
+        """Whether each copy is wrapped in a ``wrapper_class``; in other processes, in one of this name."""
+        found = [False] * self.num_envs
+        if self.copies is not None:
+            found = [is_wrapped(single, wrapper_class) for single in self.copies]
+        elif isinstance(self.env.unwrapped, AsyncVectorEnv):
+            found = [f"<{wrapper_class.__name__}<" in text for text in self.env.unwrapped.call("__str__")]
+        return [found[i] for i in self._get_indices(indices)]
 
     def get_images(self) -> list[np.ndarray | None]:
         """A picture of each copy; None where there is none."""
-        pictures: Any = self.env.render() or [None] * self.num_envs
-        return list(pictures)
+        pictures: Any = self.env.render()
+        return [None] * self.num_envs if pictures is None else list(pictures)
 
 
 def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.bool_]], Any] | None:
@@ -202,8 +213,9 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
     rows = np.asarray(obs)
     if rows.shape[:1] != (n_envs,):
         raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
-    # Rows of one array share their form; what is not in a Box must be in its space too
-    for i in range(1 if isinstance(space, spaces.Box) else n_envs):
+    # Rows of one array share their form; other numbers than those of a Box of this kind are checked one by one
+    share_form = isinstance(space, spaces.Box) and rows.dtype.kind == np.dtype(space.dtype).kind
+    for i in range(1 if share_form else n_envs):
         check_observation(space, rows[i], i)
 
 

@@ -3,13 +3,16 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Corridor
+from environments import Corridor, Random
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TransformAction, TransformReward
 from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from models import make
 from packaging.version import Version
 from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference
@@ -172,6 +175,17 @@ def test_attributes_and_methods_where_the_environment_can():
     for indices in ([0], [1, 0, 2], [0, 0, 0]):
         with pytest.raises(NotImplementedError):
             env.env_method("has_wrapper_attr", "lengths", indices=indices)
+    assert env.has_attr("lengths") and not env.has_attr("missing") and len(env.reset()) == N_ENVS
+    env.close()
+
+
+@pytest.mark.parametrize("vector_env", [SyncVectorEnv, AsyncVectorEnv])
+def test_evaluation_finds_a_monitor(vector_env):
+    """Below a wrapper that changes rewards it has those of the task."""
+    env = synced(lambda: TransformReward(Monitor(Corridor((3,))), lambda reward: reward + 10), vector_env=vector_env)
+    assert env.env_is_wrapped(Monitor) == [True] * N_ENVS and env.env_is_wrapped(TransformAction) == [False] * N_ENVS
+    returns, lengths = evaluate_policy(make("steps", env), env, N_ENVS, return_episode_rewards=True)
+    assert lengths == [3] * N_ENVS and max(returns) < 10
     env.close()
 
 
@@ -189,6 +203,8 @@ def test_pictures():
     env = synced(lambda: gym.make("CartPole-v1", render_mode="rgb_array"))
     env.reset()
     assert len(env.get_images()) == N_ENVS and env.get_images()[0].ndim == 3 and env.render().ndim == 3
+    env.env.render = lambda: np.zeros((N_ENVS, 4, 4, 3))
+    assert [picture.shape for picture in env.get_images()] == [(4, 4, 3)] * N_ENVS
     env.close()
 
 
@@ -231,6 +247,15 @@ def test_other_forms_of_observations_are_accepted(form):
     env = synced(lambda: gym.make("CartPole-v1"), vector_env=Malformed)
     env.env.change = lambda obs, rewards: (form(obs), rewards)
     assert make("steps", env).learn(100).num_timesteps >= 100
+
+
+def test_each_row_of_other_numbers_is_checked():
+    env = synced(lambda: Random(spaces.Box(0, 255, (4,), np.uint8)), vector_env=Malformed)
+    env.env.change = lambda obs, rewards: (obs.astype(np.float32), rewards)
+    assert make("steps", env).learn(100).num_timesteps >= 100
+    env.env.n_steps, env.env.change = 0, lambda obs, rewards: (obs + np.array([[0], [0.5], [0]]), rewards)
+    with pytest.raises(ValueError, match=r"observation of environment 1 must have .* that fits uint8"):
+        make("steps", env).learn(100)
 
 
 @pytest.mark.skipif(Version(gym.__version__) < Version("1.4"), reason="Gymnasium counts a step too few")
