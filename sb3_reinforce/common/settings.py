@@ -79,6 +79,11 @@ def check_callback(name: str, value: Any) -> Any:
     return value
 
 
+def check_verbose(name: str, value: Any) -> int:
+    """Return a level of output; many write True for 1."""
+    return check_integer(name, int(value) if isinstance(value, bool) else value, 0)
+
+
 check_count = partial(check_integer, low=1)
 COMMON_ARGUMENTS: dict[str, Check] = {
     "policy": partial(check_kind, kinds=(str, type), allowed="a name or a class"),
@@ -89,7 +94,7 @@ COMMON_ARGUMENTS: dict[str, Check] = {
     "stats_window_size": check_count,
     "tensorboard_log": optional(partial(check_kind, kinds=(str, os.PathLike))),
     "policy_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
-    "verbose": partial(check_integer, low=0),
+    "verbose": check_verbose,
     "seed": optional(partial(check_integer, low=0, high=MAX_SEED)),
     "device": check_device,
 }

@@ -62,9 +62,12 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
         values = np.asarray(obs)
     except ValueError as error:
         raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
-    # Integers may stand for real numbers, but not fractions for integers
-    kinds = "biuf" if np.dtype(space.dtype).kind == "f" else "biu"
-    if values.shape != space.shape or values.dtype.kind not in kinds:
+    fits = values.shape == space.shape and values.dtype.kind in "biuf"
+    if fits and values.dtype.kind == "f" and np.dtype(space.dtype).kind != "f":
+        # Integers may stand for real numbers, and whole numbers for integers, but not fractions
+        with np.errstate(invalid="ignore"):
+            fits = np.array_equal(values.astype(space.dtype), values)
+    if not fits:
         raise BadData(
             f"The observation of environment {env} must have shape {space.shape} and a dtype that fits {space.dtype}, "
             f"as its space has, got shape {values.shape} and dtype {values.dtype}: {obs!r}"

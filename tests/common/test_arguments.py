@@ -33,6 +33,7 @@ WRONG = {
     "check_number": [*NO_NUMBERS, NAN, INF, -INF],
     "CheckedSchedule": [*NO_NUMBERS, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
     "check_integer": [*NO_NUMBERS, NAN, INF, 2.5, 2**63],
+    "check_verbose": ["x", [1], None, 2.5, -1],
     "check_flag": ["no", 1, None],
     "check_choice": ["batch", 3, None],
     "check_kind": [3, [1], None, b"mean"],
@@ -290,6 +291,11 @@ def test_learning_after_a_load_needs_an_environment(kind, tmp_path):
         model.learn(8)
     model.set_env(make_vec_env("CartPole-v1", 1))
     assert model.learn(8).num_timesteps >= 8
+
+
+@both
+def test_verbose_may_be_a_flag(kind):
+    assert [make(kind, verbose=value).verbose for value in (True, False, 2)] == [1, 0, 2]
 
 
 @both

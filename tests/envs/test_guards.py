@@ -167,13 +167,21 @@ INTEGERS = [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary
 
 @all_kinds
 @pytest.mark.parametrize(
-    ("space", "value"), [*product(INTEGERS, (-1, 3, 0.5)), (spaces.Box(0, 255, (4,), np.uint8), 0.5)]
+    ("space", "value"),
+    [*product(INTEGERS, (-1, 3, 0.5)), *((spaces.Box(0, 255, (4,), np.uint8), value) for value in (-1.0, 0.5, np.nan))],
 )
 def test_numbers_that_the_space_does_not_have(space, value, kind):
     value = np.full(space.shape, value)[()]
     env = of_two(fault="observation", at=5, value=value, observation_space=space)
     with pytest.raises(ValueError, match=r"observation of environment 1 must .*\(step 4 since"):
         make(kind, env).learn(400)
+
+
+@all_kinds
+@pytest.mark.parametrize("space", [*INTEGERS, spaces.Box(0, 255, (4,), np.uint8)], ids=str)
+def test_whole_numbers_stand_for_integers(space, kind):
+    env = of_two(fault="observation", at=5, value=np.ones(space.shape)[()], observation_space=space)
+    assert make(kind, env).learn(40).num_timesteps >= 40
 
 
 @all_kinds
