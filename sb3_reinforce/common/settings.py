@@ -80,7 +80,7 @@ def check_callback(name: str, value: Any) -> Any:
 
 
 def check_verbose(name: str, value: Any) -> int:
-    """Return a level of output; many write True for 1."""
+    """Return a level of output. True counts as 1, as in Stable-Baselines3."""
     return check_integer(name, int(value) if isinstance(value, bool) else value, 0)
 
 

@@ -21,7 +21,7 @@ from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
-from sb3_reinforce.estimation.weights import by_step, returns_minus_baseline
+from sb3_reinforce.estimation.weights import by_step, without_rounding
 from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
@@ -169,7 +169,7 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
     """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
     baseline = check_function("baseline", collector.baseline, BASELINES)
-    expected = rollout.used * returns_minus_baseline(rollout, baseline(rollout))
+    expected = without_rounding(rollout.returns - baseline(rollout).cpu(), rollout.returns) * rollout.used
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
 
 

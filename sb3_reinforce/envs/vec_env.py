@@ -143,7 +143,7 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Whether each copy is wrapped in a ``wrapper_class``; in other processes, in one of this name."""
+        """Whether each copy is wrapped in a ``wrapper_class``; in other processes by its name, without subclasses."""
         found = [False] * self.num_envs
         if self.copies is not None:
             found = [is_wrapped(single, wrapper_class) for single in self.copies]
@@ -213,8 +213,8 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
     rows = np.asarray(obs)
     if rows.shape[:1] != (n_envs,):
         raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
-    # Rows of one array share their form; other numbers than those of a Box of this kind are checked one by one
-    share_form = isinstance(space, spaces.Box) and rows.dtype.kind == np.dtype(space.dtype).kind
+    # Rows of one array share their form, but some floats are whole numbers and some are not
+    share_form = isinstance(space, spaces.Box) and (rows.dtype.kind != "f" or np.dtype(space.dtype).kind == "f")
     for i in range(1 if share_form else n_envs):
         check_observation(space, rows[i], i)
 

@@ -89,7 +89,7 @@ def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_crit
 
 def compute_advantages(rollout: Rollout, baseline: Any) -> Floats:
     """``m_t (G_t − b_t)``, shape ``(n_steps, n_envs)``, float32."""
-    return (rollout.used * returns_minus_baseline(rollout, baseline)).float().numpy()
+    return returns_minus_baseline(rollout, baseline).masked_fill(~rollout.used, 0.0).float().numpy()
 
 
 def returns_minus_baseline(rollout: Rollout, baseline: Any) -> th.Tensor:

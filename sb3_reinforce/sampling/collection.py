@@ -127,12 +127,9 @@ def collect(
         starts.append(dones.astype(bool))
         n_steps += 1
         rollout_buffer.pos = n_steps
-        if dones.any() or any("episode" in info for info in infos):
-            # Below a wrapper that makes one episode of several, Monitor records each of them
-            waited = np.flatnonzero(extent.remaining)
-            model._update_info_buffer([infos[i] for i in waited], dones[waited])
         if dones.any():
             counted = extent.count(starts[-1], n_steps)
+            model._update_info_buffer([infos[i] for i in counted], dones[counted])
             for i in counted:
                 if infos[i].get("TimeLimit.truncated") and infos[i].get("terminal_observation") is not None:
                     # Of a dict only what the space has; some VecEnvs write the next one into the same array

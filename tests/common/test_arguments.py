@@ -294,8 +294,10 @@ def test_learning_after_a_load_needs_an_environment(kind, tmp_path):
 
 
 @both
-def test_verbose_may_be_a_flag(kind):
+def test_verbose_may_be_a_flag(kind, tmp_path):
     assert [make(kind, verbose=value).verbose for value in (True, False, 2)] == [1, 0, 2]
+    make(kind).save(tmp_path / "model")
+    assert KINDS[kind][0].load(tmp_path / "model", verbose=True).verbose == 1
 
 
 @both

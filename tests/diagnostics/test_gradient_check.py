@@ -16,6 +16,7 @@ from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.estimation import weights
 
 ACTION_SPACES = [
     spaces.Discrete(3),
@@ -265,6 +266,11 @@ def failures(algorithm=REINFORCE, policy="MlpPolicy"):
 )
 def test_what_is_wrong_is_named(wrong, lines):
     assert failures(**wrong) == lines
+
+
+def test_weights_are_not_checked_by_what_computes_them(monkeypatch):
+    monkeypatch.setattr(weights, "check_baseline", lambda baseline, rollout: -baseline)
+    assert failures() == ["weights"]
 
 
 def test_negation_is_seen_in_every_action_space():

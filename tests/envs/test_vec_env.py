@@ -198,13 +198,17 @@ def test_finite_difference_trains_on_it():
         FiniteDifference("LinearPolicy", native(), n_delta=12).learn(50)
 
 
+def test_pictures_in_one_array():
+    env = synced(Corridor)
+    env.env.render = lambda: np.zeros((N_ENVS, 4, 4, 3))
+    assert [picture.shape for picture in env.get_images()] == [(4, 4, 3)] * N_ENVS
+
+
 def test_pictures():
     pytest.importorskip("pygame")
     env = synced(lambda: gym.make("CartPole-v1", render_mode="rgb_array"))
     env.reset()
     assert len(env.get_images()) == N_ENVS and env.get_images()[0].ndim == 3 and env.render().ndim == 3
-    env.env.render = lambda: np.zeros((N_ENVS, 4, 4, 3))
-    assert [picture.shape for picture in env.get_images()] == [(4, 4, 3)] * N_ENVS
     env.close()
 
 

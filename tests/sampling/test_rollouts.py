@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
-from models import make
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -50,31 +49,6 @@ def test_a_monitor_may_refuse_the_reset_that_whole_episodes_begin_with():
         REINFORCE("MlpPolicy", DummyVecEnv(envs), n_episodes=2, seed=0, device="cpu").learn(1000)
     envs = [partial(Monitor, gym.make("CartPole-v1"), allow_early_resets=False) for _ in range(2)]
     assert REINFORCE("MlpPolicy", DummyVecEnv(envs), n_steps=16, device="cpu").learn(32).num_timesteps == 32
-
-
-class Rounds(gym.Wrapper):
-    """Three episodes of the environment below are one."""
-
-    def reset(self, **kwargs):
-        self.n_rounds = 0
-        return self.env.reset(**kwargs)
-
-    def step(self, action):
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        self.n_rounds += terminated
-        is_over = self.n_rounds == 3
-        if terminated and not is_over:
-            obs, _ = self.env.reset()
-        return obs, reward, is_over, truncated, info
-
-
-def test_each_episode_that_monitor_records_is_logged():
-    """Also within an episode of the rollout, and none beyond the quota."""
-    env = DummyVecEnv([lambda: Rounds(Monitor(Corridor()))] * 2)
-    for algorithm in (REINFORCE, A2C):
-        lengths = [each["l"] for each in algorithm("MlpPolicy", env, n_steps=8, device="cpu").learn(80).ep_info_buffer]
-        assert lengths == [3] * (2 * 13)
-    assert [each["l"] for each in make("episodes", env, n_episodes=1).learn(1).ep_info_buffer] == [3] * 3
 
 
 def test_lengths_of_used_episodes_are_drawn_without_bias():
