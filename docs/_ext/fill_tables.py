@@ -3,7 +3,8 @@ Write the tables into the pages, computed from the rows of ``examples/benchmarks
 
     python docs/_ext/fill_tables.py
 
-Each stands between ``<!-- name -->`` and ``<!-- end -->``, where the name is a function of ``tables.py``.
+Each stands between ``<!-- name -->`` and ``<!-- end -->``, where the name is a function of ``tables.py`` or
+``tuning.py``.
 """
 
 import re
@@ -24,7 +25,7 @@ def filled(text: str) -> str:
 
 def computed(name: str) -> str:
     """A table, with empty lines around it, or a figure of a sentence."""
-    text = tuning.runs() if name == "runs" else getattr(tables, name)()
+    text = getattr(tuning if name in ("runs", "held_out") else tables, name)()
     return f"\n\n{text}\n\n" if text.startswith("|") else text
 
 

@@ -3,7 +3,7 @@
 import inspect
 
 import yaml
-from cells import RESULTS, counted, markdown, read, short
+from cells import RESULTS, counted, markdown, number, read, short, spread
 from tables import final
 
 from sb3_reinforce import REINFORCE
@@ -31,6 +31,20 @@ def changes(task: str, text: str) -> str:
         # It has no use for a target
         del theirs["target_kl"]
     return ", ".join(f"`{key}={value}`" for key, value in theirs.items() if ours[key] != value)
+
+
+def held_out() -> str:
+    """The ten seeds of the choice beside the reported ones, with the shipped settings; a seed's last run counts."""
+    rows = read("tuning").query("algorithm == 'reinforce' and 100 <= seed < 110")
+    reported = final("comparison", "comparison_others").query("algorithm == 'reinforce'").groupby(["task", "budget"])
+    lines = []
+    for (task, budget, text), same in rows.groupby(["task", "budget", "settings"]):
+        returns = same.groupby("seed")["return"].last()
+        if len(returns) == 10 and not changes(str(task), text):
+            shown = counted(reported.get_group((task, budget))["return"])
+            worst = number(returns.nsmallest(3).mean())
+            lines.append([f"{task} ({short(int(budget))})", spread(returns), worst, shown])
+    return markdown(["task (steps)", "seeds 100 to 109", "mean of the worst three", "reported [seeds]"], lines)
 
 
 def runs() -> str:
