@@ -26,6 +26,7 @@ from sb3_reinforce.recurrent import RecurrentREINFORCE
 parser = argparse.ArgumentParser()
 parser.add_argument("--length", type=int, default=5, help="steps from the cue to the junction")
 parser.add_argument("--memory", choices=("none", "rnn", "gru", "lstm"), default="rnn")
+parser.add_argument("--forget-bias", type=float, default=0.0, help="of an LSTM's forget gates before training")
 parser.add_argument("--timesteps", type=int, default=30_000)
 parser.add_argument("--seed", type=int, default=0)
 # A notebook is started with other arguments
@@ -64,8 +65,9 @@ class TMaze(gym.Env):
 
 
 # %% [markdown]
-# The memory is an Elman network with orthogonal weights, which keeps a signal for long. Exploration must outlast the
-# discovery that the cue matters, so the entropy bonus falls to 0 over the training.
+# The memory is an Elman network with orthogonal weights, which keeps a signal for long. The forget gates of an LSTM
+# start half open and halve it at each step, so that long corridors need a bias. Exploration must outlast the discovery
+# that the cue matters, so the entropy bonus falls to 0 over the training.
 
 # %%
 settings = {
@@ -88,6 +90,9 @@ def score(memory):
     else:
         policy_kwargs = {"memory": memory, "lstm_hidden_size": 32}
         model = RecurrentREINFORCE("MlpLstmPolicy", env, policy_kwargs=policy_kwargs, **settings)
+        if memory == "lstm":
+            # PyTorch's order of the gates: input, forget, cell, output
+            model.policy.lstm_actor.bias_ih_l0.data[32:64] = arguments.forget_bias
     model.learn(arguments.timesteps, progress_bar=True)
     eval_env = make_vec_env(TMaze, n_envs=16, seed=1000 + arguments.seed, env_kwargs=env_kwargs)
     mean, _ = evaluate_policy(model, eval_env, n_eval_episodes=200)
