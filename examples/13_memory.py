@@ -26,7 +26,7 @@ from sb3_reinforce.recurrent import RecurrentREINFORCE
 parser = argparse.ArgumentParser()
 parser.add_argument("--length", type=int, default=5, help="steps from the cue to the junction")
 parser.add_argument("--memory", choices=("none", "rnn", "gru", "lstm"), default="rnn")
-parser.add_argument("--forget-bias", type=float, default=0.0, help="of an LSTM's forget gates before training")
+parser.add_argument("--forget-bias", type=float, default=0.0, help="of the forget gates of lstm before training")
 parser.add_argument("--timesteps", type=int, default=30_000)
 parser.add_argument("--seed", type=int, default=0)
 # A notebook is started with other arguments
@@ -65,9 +65,9 @@ class TMaze(gym.Env):
 
 
 # %% [markdown]
-# The memory is an Elman network with orthogonal weights, which keeps a signal for long. The forget gates of an LSTM
-# start half open and halve it at each step, so that long corridors need a bias. Exploration must outlast the discovery
-# that the cue matters, so the entropy bonus falls to 0 over the training.
+# The memory is an Elman network with orthogonal weights, which keeps a signal for long. The gates of an LSTM start half
+# open, and the cue fades; `--forget-bias 2` keeps it longer. Exploration must outlast the discovery that the cue
+# matters, so the entropy bonus falls to 0 over the training.
 
 # %%
 settings = {

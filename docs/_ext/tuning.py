@@ -33,8 +33,8 @@ def changes(task: str, text: str) -> str:
     return ", ".join(f"`{key}={value}`" for key, value in theirs.items() if ours[key] != value)
 
 
-def held_out() -> str:
-    """The ten seeds of the choice beside the reported ones, with the shipped settings; a seed's last run counts."""
+def chosen_on() -> str:
+    """The ten seeds of the choice beside the reported ones, with the shipped settings; a seed's later run counts."""
     rows = read("tuning").query("algorithm == 'reinforce' and 100 <= seed < 110")
     reported = final("comparison", "comparison_others").query("algorithm == 'reinforce'").groupby(["task", "budget"])
     lines = []
