@@ -33,6 +33,7 @@ from sb3_reinforce.estimation.perturbations import (
     default_delta_std,
     default_n_delta,
     new_generator,
+    sample_deltas,
 )
 from sb3_reinforce.estimation.weights import ROUNDING
 from sb3_reinforce.policies import parameters
@@ -60,9 +61,9 @@ class FiniteDifference(BasePolicyGradient):
     of one VecEnv: plain MLPs in one batched forward pass, other policies one after the other.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
-    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it. Below a
-    wrapper that may change rewards (one that Stable-Baselines3 does not have) they are sums of the wrapper's rewards,
-    and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
+    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it. If a
+    wrapper above it may change rewards (one that Stable-Baselines3 does not have), they are sums of that wrapper's
+    rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -280,8 +281,8 @@ class FiniteDifference(BasePolicyGradient):
             n_delta = cast(int, self.n_delta)
             generator = cast(th.Generator, self._generator)
             delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
-            directions = self._function("perturbation", PERTURBATIONS)(n_delta, n, generator)
-            deltas = delta_std * check_tensor("perturbation", directions, (n_delta, n))
+            perturbation = self._function("perturbation", PERTURBATIONS)
+            deltas = sample_deltas(perturbation, n_delta, n, delta_std, generator)
             estimator = self._function("estimator", ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)

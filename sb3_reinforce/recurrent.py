@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
 from sb3_reinforce.estimation.returns import Bools
+from sb3_reinforce.policies.critic import next_values_of
 from sb3_reinforce.policies.evaluation import Route
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
@@ -41,8 +42,7 @@ class RecurrentREINFORCE(REINFORCE):
     cut comes from one more step of its sequence. The critic's minibatches are whole sequences of about ``batch_size``
     steps.
 
-    ``policy_kwargs`` as in sb3-contrib: ``lstm_hidden_size``, ``n_lstm_layers``, ``enable_critic_lstm``,
-    ``shared_lstm``, ``lstm_kwargs``; ``memory`` is ``"lstm"``, ``"gru"`` or ``"rnn"``.
+    ``policy_kwargs`` are the arguments of :class:`~sb3_reinforce.recurrent.MlpLstmPolicy`, such as ``memory="gru"``.
 
     To predict, pass the returned state to the next call; without it each call starts an episode:
 
@@ -195,8 +195,7 @@ class RecurrentREINFORCE(REINFORCE):
         # An episode that has ended with the rollout does not go on in the next observation, whose V is not asked for
         following["sequence"][:n_envs][th.as_tensor(dones[-1])] = -1
         values = policy.sequence_values(concatenate(flatten(rows), following)).flatten().cpu().numpy()
-        after = values[n_steps * n_envs :]
-        values = values[: n_steps * n_envs].reshape(dones.shape)
-        next_values = np.where(dones, 0.0, np.vstack([values[1:], after[:n_envs]]))
-        next_values[steps[n_envs:], envs[n_envs:]] = after[n_envs:]
-        return values, next_values
+        values, last_values, terminal_values = np.split(values, [n_steps * n_envs, (n_steps + 1) * n_envs])
+        values = values.reshape(dones.shape)
+        at_limits = dict(zip(terminal_obs, terminal_values, strict=True))
+        return values, next_values_of(values, dones, last_values, at_limits)

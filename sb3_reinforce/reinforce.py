@@ -1,7 +1,5 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
-import copy
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -10,7 +8,6 @@ import torch as th
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -511,34 +508,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         )
         self.logger.record("train/value_loss", value_loss)
         self.logger.record("train/explained_variance", explained_variance(values.numpy(), batch.returns.cpu().numpy()))
-
-    def sampling_copy(self, n_episodes: int, baseline: str | Baseline | None = None) -> "REINFORCE":
-        """
-        A copy for measurements: it shares policy and environments, with its own log, counters and rollouts.
-
-        :param n_episodes: Whole episodes per rollout
-        :param baseline: Its baseline; None for ``"value"`` with a critic, else ``"none"``
-        :return: The copy; ``collect_rollouts`` resets the environments first
-        """
-        model = copy.copy(self)
-        model.n_steps = None  # type: ignore[assignment]
-        model.n_episodes = n_episodes
-        model.episodes_per_start = 1
-        model.baseline = baseline or ("value" if self.has_critic else "none")
-        if not model.has_critic:
-            # λ weights values, and there are none
-            model.gae_lambda = 1.0
-        # A schedule that the copy renews is still to be renewed here
-        model._schedules = dict(self._schedules)
-        model._processes = None
-        model.set_logger(Logger(folder=None, output_formats=[]))
-        model.ep_info_buffer = deque(maxlen=1)
-        model.ep_success_buffer = deque(maxlen=1)
-        model.rollout_buffer = self.rollout_buffer_class(  # type: ignore[misc]
-            1, self.observation_space, self.action_space, self.device, n_envs=self.n_envs, **self.rollout_buffer_kwargs
-        )
-        model._last_episode_starts = np.zeros(self.n_envs, dtype=bool)
-        return model
 
     @guarded
     @together

@@ -39,7 +39,7 @@ FOREIGN = {
 }
 MAX_LINES = 250
 # The docstring of an algorithm's class is the reference of its arguments, and its update is read in one place
-LONGER = {"reinforce.py", "finite_difference.py", "recurrent.py"}
+LONGER = {"reinforce.py", "finite_difference.py"}
 PACKAGES = ("", ".diagnostics", ".diagnostics.plots", ".estimation", ".recurrent", ".zoo")
 PUBLIC = tuple(f"sb3_reinforce{package}" for package in PACKAGES)
 # What a public module needs beside the dependencies

@@ -23,7 +23,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 # The arguments that may differ between processes
 OWN_ARGUMENTS = {"verbose", "device", "tensorboard_log"}
-# The attributes of process 0 that all take over before they collect; without an observation they reset environments
+# The attributes of process 0 that all take over before they collect; a ``_last_obs`` of None lets all reset too
 SHARED = (bool, int, float, str, type(None), th.Generator)
 
 

@@ -79,7 +79,7 @@ def compare_baselines(
     check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
     check_number("confidence", confidence, 0, 1)
-    counts = resamples(n_episodes, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
+    counts = resamples(n_episodes, n_resamples, seed)
     with seeded(model.policy, seed):
         rollout = sample(model, n_episodes, progress_bar=progress_bar)
         rows = baseline_rows(rollout, functions, reference, counts, confidence)

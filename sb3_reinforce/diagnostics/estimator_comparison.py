@@ -15,13 +15,19 @@ from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, 
 from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
 from sb3_reinforce.envs.starts import reseed
 from sb3_reinforce.estimation import baselines
-from sb3_reinforce.estimation.estimators import ESTIMATORS, check_tensor
-from sb3_reinforce.estimation.perturbations import PERTURBATIONS, Perturbation, default_delta_std, default_n_delta
+from sb3_reinforce.estimation.estimators import ESTIMATORS
+from sb3_reinforce.estimation.perturbations import (
+    PERTURBATIONS,
+    Perturbation,
+    default_delta_std,
+    default_n_delta,
+    sample_deltas,
+)
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.parameters import searched_parameters
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.measurement import undisturbed
+from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
 
@@ -112,8 +118,7 @@ def compare_estimators(
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
                 k = default_n_delta(name, n_parameters) if n_delta is None else n_delta
-                directions = (draw(k, n_parameters, generator) for _ in range(n_estimates))
-                deltas = (scale * check_tensor("perturbation", each, (k, n_parameters)) for each in directions)
+                deltas = (sample_deltas(draw, k, n_parameters, scale, generator) for _ in range(n_estimates))
                 gradients = th.stack([ESTIMATORS[name](utility, utility.theta, each) for each in deltas])
                 n_steps = utility.n_steps - n_steps_before
             seconds = (time.perf_counter() - begin) / len(gradients)
@@ -149,7 +154,7 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     Gradients of whole episodes at γ = 1 with the leave-one-out baseline, for the actor without ``log_std``, shape
     ``(n_episodes, n)``, float64; and the environment steps of all environments.
     """
-    collector = as_reinforce(model).sampling_copy(n_episodes, "none")
+    collector = sampling_copy(as_reinforce(model), n_episodes, "none")
     collector.gamma = 1.0
     collector.reward_to_go = True
     collector.discount_scores = False

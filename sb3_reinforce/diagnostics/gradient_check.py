@@ -25,7 +25,7 @@ from sb3_reinforce.estimation.weights import by_step, without_rounding
 from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.measurement import undisturbed
+from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 
 # By check: the largest error that passes, and what the error compares
 CHECKS = {
@@ -113,7 +113,7 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
 def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     """The error of each check; the last one trains the model's policy."""
-    collector = model.sampling_copy(n_episodes, model.baseline)
+    collector = sampling_copy(model, n_episodes, model.baseline)
     with undisturbed(model):
         rollout = collect_episodes(collector)
     policy = rollout.policy
@@ -169,7 +169,8 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
     """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
     baseline = check_function("baseline", collector.baseline, BASELINES)
-    expected = without_rounding(rollout.returns - baseline(rollout).cpu(), rollout.returns) * rollout.used
+    differences = without_rounding(rollout.returns - baseline(rollout).cpu(), rollout.returns)
+    expected = differences.masked_fill(~rollout.used, 0.0)
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
 
 

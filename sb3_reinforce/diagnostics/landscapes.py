@@ -135,14 +135,21 @@ def landscape(
     for name, given in gradients.items():
         shape = (len(given), n) if isinstance(given, th.Tensor) and given.dim() == 2 else (n,)
         gradient = check_directions(f"gradients[{name!r}]", given, shape)
-        projection = th.linalg.lstsq(plane.T, gradient.reshape(-1, n).T).solution.T.reshape(*shape[:-1], 2)
-        steps[name] = (extent * projection / projection.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
+        steps[name] = extent * projected(gradient, plane)
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
     bar = episode_bar(progress_bar, n_episodes * len(grid))
     with seeded(cast(ActorCriticPolicy, model.policy), seed), bar as utility.bar:
         utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
     return Landscape(scales.numpy(), utilities.numpy(), steps, n_episodes)
+
+
+def projected(gradients: th.Tensor, plane: th.Tensor) -> np.ndarray:
+    """The projections of gradients ``(..., n)`` on a plane (2, n), as (x, y) of length 1, shape ``(..., 2)``."""
+    flat = gradients.reshape(-1, plane.shape[1])
+    found = th.linalg.lstsq(plane.T, flat.T).solution.T.reshape(*gradients.shape[:-1], 2)
+    directions: np.ndarray = (found / found.norm(dim=-1, keepdim=True).clamp(min=1e-300)).numpy()
+    return directions
 
 
 def filter_normalized(direction: th.Tensor, like: Sequence[th.Tensor]) -> th.Tensor:

@@ -86,7 +86,7 @@ def rate_too_large(history: History) -> str | None:
         )
     if before - after > 0.5 and updates[-1].temperature > 0.9 * updates[0].temperature:
         return (
-            f"The entropy collapses: within {len(steps)} updates the policy went from {before:.0%} to {after:.0%} of "
+            f"The entropy collapses: within {len(updates)} updates the policy went from {before:.0%} to {after:.0%} of "
             f"the randomness that it could have. {remedy}, or raise ent_coef"
         )
     return None

@@ -16,7 +16,7 @@ from sb3_reinforce.common.arguments import check_integer, check_kind
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import by_step, compute_weights
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.measurement import undisturbed
+from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 
 
 def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progress_bar: bool = False) -> Rollout:
@@ -37,7 +37,7 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progr
     :raises ValueError: If there are too few episodes, or the model has no environment
     """
     check_model(model)
-    collector = model.sampling_copy(check_integer("n_episodes", n_episodes, 2), baseline)
+    collector = sampling_copy(model, check_integer("n_episodes", n_episodes, 2), baseline)
     with undisturbed(model), episode_bar(progress_bar, n_episodes) as bar:
         return collect_episodes(collector, bar)
 

@@ -18,7 +18,7 @@ from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
 from sb3_reinforce.estimation.weights import without_rounding
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.measurement import start_from, undisturbed
+from sb3_reinforce.sampling.measurement import sampling_copy, start_from, undisturbed
 
 # Sizes of groups to predict, and episodes per start
 SIZES = (2, 4, 8)
@@ -75,7 +75,7 @@ def compare_starts(
     step = env.num_envs // math.gcd(env.num_envs, N_PER_START)
     n_starts = math.ceil(check_integer("n_starts", n_starts, 4) / step) * step
     check_number("confidence", confidence, 0, 1)
-    counts = resamples(n_starts, check_integer("n_resamples", n_resamples, 1), check_integer("seed", seed, 0))
+    counts = resamples(n_starts, n_resamples, seed)
     with seeded(model.policy, seed):
         rollouts = sample_starts(model, n_starts, progress_bar)
         # G_t and m_t, (n_steps, n_starts, N_PER_START)
@@ -91,7 +91,7 @@ def compare_starts(
 def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -> list[Rollout]:
     """Rollouts of one episode per environment, which play ``N_PER_START`` episodes of each start in turn."""
     env = env_of(model)
-    collector = model.sampling_copy(env.num_envs, "none")
+    collector = sampling_copy(model, env.num_envs, "none")
     seeds = th.randint(2**31, (n_starts,)).numpy().repeat(N_PER_START)
     rollouts = []
     firsts = []

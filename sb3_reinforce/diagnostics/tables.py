@@ -6,6 +6,8 @@ from typing import Any, Generic, TypeVar
 
 import torch as th
 
+from sb3_reinforce.common.arguments import check_integer
+
 Row = TypeVar("Row")
 
 
@@ -32,10 +34,11 @@ UNKNOWN = Estimate(float("nan"), float("nan"), float("nan"))
 
 def resamples(m: int, n_resamples: int, seed: int) -> th.Tensor:
     """How often each of m samples occurs in the sample itself (row 0) and in resamples, ``(1 + n_resamples, m)``."""
-    drawn = th.randint(m, (n_resamples, m), generator=th.Generator().manual_seed(seed))
+    size = (check_integer("n_resamples", n_resamples, 1), m)
+    drawn = th.randint(m, size, generator=th.Generator().manual_seed(check_integer("seed", seed, 0)))
     # A resample that repeats one sample m times has no pairs, so it gets a second one
     drawn[:, 1] = th.where((drawn == drawn[:, :1]).all(1), (drawn[:, 0] + 1) % m, drawn[:, 1])
-    counts = th.zeros(n_resamples, m, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
+    counts = th.zeros(size, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
     return th.cat([th.ones(1, m, dtype=th.float64), counts])
 
 

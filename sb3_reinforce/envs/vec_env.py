@@ -35,7 +35,7 @@ class GymnasiumVecEnv(VecEnv):
         CartPole, which is then reset within the step
     :raises TypeError: If ``env`` is not a ``gymnasium.vector.VectorEnv``
     :raises ValueError: If it resets its copies in place of the next step (``NEXT_STEP``), or is ``DISABLED`` below
-        Gymnasium's ``RecordEpisodeStatistics``, which then forgets the episodes that go on when others end
+        Gymnasium's ``RecordEpisodeStatistics`` or ``NormalizeReward``, which then forget the episodes that go on
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]):

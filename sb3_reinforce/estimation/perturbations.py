@@ -11,6 +11,8 @@ from typing import TypeAlias
 
 import torch as th
 
+from sb3_reinforce.estimation.estimators import check_tensor
+
 # (k, n, generator) -> deltas of shape (k, n), float64
 Perturbation: TypeAlias = Callable[[int, int, th.Generator], th.Tensor]
 
@@ -84,6 +86,12 @@ PERTURBATIONS: dict[str, Perturbation] = {
     "sphere": sphere,
 }
 
+
+def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, generator: th.Generator) -> th.Tensor:
+    """``Δ = delta_std · δ``, shape ``(k, n)``; the directions δ, which a user's function may draw, are checked."""
+    return delta_std * check_tensor("perturbation", perturbation(k, n, generator), (k, n))
+
+
 # More perturbations cost more than rough gradients and more updates do
 MAX_DEFAULT_N_DELTA = 64
 # The utility of a policy near zero does not tell smaller perturbations from none
@@ -91,7 +99,7 @@ MIN_DEFAULT_DELTA_STD = 0.05
 
 
 def default_n_delta(estimator: object, n_parameters: int) -> int:
-    """``min(2n, 64)`` perturbations for the regression and ``min(n, 64)`` for the others: as many as determine ĝ."""
+    """``min(2n, 64)`` perturbations for the regression and ``min(n, 64)`` for the others: below 64 they determine ĝ."""
     return min(2 * n_parameters if estimator == "regression" else n_parameters, MAX_DEFAULT_N_DELTA)
 
 

@@ -45,7 +45,7 @@ def complete_rollout(
     episodes_per_start: int = 1,
 ) -> tuple[Rollout, Floats, Floats]:
     """
-    What was collected, with m_t, G_t, γ^t and D; ``G_t − b_t``; and what a critic is fitted to, or without one G_t.
+    The rollout with m_t, G_t, γ^t and D; the advantages ``m_t (G_t − b_t)``; and the critic's targets, or ``m_t G_t``.
 
     ``quota`` is None for a fixed number of steps, and ``next_values`` None without a critic.
     """

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.tensors import flatten, stack, take
-from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, has_own_forward
+from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, must_call
 from sb3_reinforce.policies.plain_mlp import evaluate_layers, is_plain_extractor, overrides
 from sb3_reinforce.policies.sequences import RecurrentPolicy, sequence_minibatches
 
@@ -45,10 +45,18 @@ def values_after(
     def predict(obs: Any) -> np.ndarray:
         return value(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
 
-    next_values = np.where(dones, 0.0, np.vstack([values[1:], predict(last_obs)]))
-    if terminal_obs:
-        steps, envs = zip(*terminal_obs, strict=True)
-        next_values[steps, envs] = predict(stack(list(terminal_obs.values())))
+    last_values = predict(last_obs)
+    terminal_values = predict(stack(list(terminal_obs.values()))) if terminal_obs else ()
+    return next_values_of(values, dones, last_values, dict(zip(terminal_obs, terminal_values, strict=True)))
+
+
+def next_values_of(
+    values: np.ndarray, dones: NDArray[np.bool_], last_values: np.ndarray, terminal_values: dict[tuple[int, int], float]
+) -> np.ndarray:
+    """V(s_{t+1}) from V(s_t), V after the last step ``(n_envs,)`` and V by (step, environment) at time limits."""
+    next_values = np.where(dones, 0.0, np.vstack([values[1:], last_values]))
+    for where, value in terminal_values.items():
+        next_values[where] = value
     return next_values
 
 
@@ -124,7 +132,7 @@ def value_of_batch(
             with th.no_grad():
                 rows = {**rows, "features": policy.row_features(rows, extractor)}
         return lambda batch: policy.sequence_values(take(rows, batch))
-    if layers is None and (has_own_forward(policy) or overrides(policy, "evaluate_actions")):
+    if layers is None and must_call(policy, "evaluate_actions"):
         # V of such a policy may only be found along with log π
         return lambda batch: policy.evaluate_actions(take(obs, batch), actions[batch])[0]
     if overrides(policy, "predict_values") or not is_fixed:

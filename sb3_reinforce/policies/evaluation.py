@@ -1,7 +1,6 @@
 """
-What is asked of an actor-critic policy: log π(a|s), the entropy, V(s), and which parameters these depend on.
-
-A method that a user has overridden is called as it is. Where nothing is overridden, only the actor is evaluated.
+What is asked of an actor-critic policy: log π(a|s), the entropy, V(s), which parameters these depend on, and the
+temperature. A method that a user has overridden is called as it is; ``Route`` says which methods are called.
 """
 
 import math
@@ -68,18 +67,17 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     own_parts = overrides(policy, "predict_values", "get_distribution")
     shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
     together = with_critic and shares and not own_parts
-    own_forward = has_own_forward(policy)
     return Route(
         with_critic,
         critic=critic,
-        forward=own_forward or overrides(policy, "forward") or together,
-        evaluate_actions=own_forward or overrides(policy, "evaluate_actions") or together,
+        forward=together or must_call(policy, "forward"),
+        evaluate_actions=together or must_call(policy, "evaluate_actions"),
     )
 
 
-def has_own_forward(policy: ActorCriticPolicy) -> bool:
-    """Whether ``get_distribution`` and ``predict_values`` would bypass code or hooks that ``forward`` calls."""
-    if overrides(policy, "extract_features") or hooks_of(policy):
+def must_call(policy: ActorCriticPolicy, method: str) -> bool:
+    """Whether ``get_distribution`` and ``predict_values`` would bypass a user's code or hooks that a method calls."""
+    if overrides(policy, method, "extract_features") or hooks_of(policy):
         return True
     mlp = getattr(policy, "mlp_extractor", None)
     return isinstance(mlp, nn.Module) and (bool(hooks_of(mlp)) or "forward" in vars(mlp))
@@ -135,7 +133,7 @@ def evaluate(
 
 
 def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-    """log π(a|s), shape ``(n,)``, without evaluating the critic."""
+    """log π(a|s), shape ``(n,)``; the critic is evaluated only if a user's ``evaluate_actions`` does it."""
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
 
 
@@ -154,7 +152,7 @@ def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, action
 
 
 def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
-    """An eighth of the steps, at least 64, for an estimate; all of a recurrent policy, whose sequences stay whole."""
+    """An eighth of the steps, at least 64, for an estimate; for a recurrent policy all, since sequences stay whole."""
     if isinstance(policy, RecurrentPolicy):
         return obs, actions
     # The same places in each rollout of this length: the policy's random numbers are left alone

@@ -18,8 +18,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.common.optimization import finite_norm
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies import parameters as vectors
 from sb3_reinforce.policies.evaluation import Parameters, action_distribution
+from sb3_reinforce.policies.parameters import write
 
 DEFAULT_TARGET_KL = 0.01
 # c and the number of iterations, as in TRPO (Schulman et al., 2015, appendix C)
@@ -133,9 +133,9 @@ def line_search(
     """``θ − length · d``, shortened until the divergence is at most 1.2 times the target; returns it, or None."""
     before = to_vector(parameters)
     with ExitStack() as undo:
-        undo.callback(vectors.write, parameters, before)
+        undo.callback(write, parameters, before)
         for _ in range(MAX_REDUCTIONS):
-            vectors.write(parameters, before - length * d)
+            write(parameters, before - length * d)
             kl = measured(divergence)
             if kl <= TOLERANCE * target_kl:
                 undo.pop_all()

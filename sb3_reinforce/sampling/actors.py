@@ -21,8 +21,8 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.policies.evaluation import Route, has_own_forward
-from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, overrides, takes_vectors
+from sb3_reinforce.policies.evaluation import Route, must_call
+from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
@@ -55,8 +55,7 @@ class PolicyActor:
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy would still act as this actor does."""
-        forward = has_own_forward(policy) or overrides(policy, "forward")
-        return policy is self.policy and (self.route.forward or not forward)
+        return policy is self.policy and (self.route.forward or not must_call(policy, "forward"))
 
 
 class NumpyActor:

@@ -78,9 +78,9 @@ class EpisodeTracker:
 
 def seeds_of(shape: Sequence[int], n_episodes: int, first_seed: int) -> np.ndarray:
     """
-    Seeds of the episodes of candidates, shape ``(k, n_episodes)``.
+    Seeds of the episodes of candidates of a shape ``(k, n)`` or ``(m, k, n)``, a row of ``n_episodes`` for each.
 
-    Candidates of shape ``(k, n)`` share their seeds; of ``(m, k, n)`` only those of one column do, as in a pair.
+    Candidates ``(k, n)`` all have the same seeds; of ``(m, k, n)`` the m of a column have, as θ + δ and θ − δ.
     """
     n_columns = shape[1] if len(shape) == 3 else 1
     columns = np.arange(math.prod(shape[:-1])) % n_columns
@@ -96,7 +96,7 @@ def evaluate_candidates(
     max_episode_steps: int,
     on_step: Callable[[CandidateStep], None],
 ) -> np.ndarray:
-    """The returns Σ_t r_t, unscaled, of candidates ``(m, n)``, shape ``(m, n_episodes)``; so are seeds, or None."""
+    """Unscaled returns Σ_t r_t of candidates ``(m, n)``, shape ``(m, n_episodes)``; ``seeds`` has this shape too."""
     original = original_reward_of(env)
     returns = np.zeros((len(thetas), n_episodes))
     if seeds is not None:

@@ -87,8 +87,8 @@ def collect(
     Step the environments and write what happens into a rollout buffer, which ends with one row per step.
 
     Returns ``dones`` of shape ``(n_steps, n_envs)``, the terminal observations at time limits and the route to the
-    values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them:
-    training has no use for them.
+    values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them, or
+    ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called

@@ -1,12 +1,15 @@
 """Measurements in a model's environments, after which the model goes on from the start of an episode."""
 
-from collections.abc import Iterator
+import copy
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
@@ -43,3 +46,29 @@ def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
     model._last_obs = obs
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     return obs
+
+
+def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any] | None = None) -> Any:
+    """
+    A copy of a REINFORCE for measurements of whole episodes: it shares policy and environments, with its own log,
+    counters and rollouts. Without a baseline it has ``"value"`` with a critic, else ``"none"``.
+    """
+    sampler = copy.copy(model)
+    sampler.n_steps = None
+    sampler.n_episodes = n_episodes
+    sampler.episodes_per_start = 1
+    sampler.baseline = baseline or ("value" if model.has_critic else "none")
+    if not sampler.has_critic:
+        # λ weights values, and there are none
+        sampler.gae_lambda = 1.0
+    # A schedule that the copy renews is still to be renewed in the model
+    sampler._schedules = dict(model._schedules)
+    sampler._processes = None
+    sampler.set_logger(Logger(folder=None, output_formats=[]))
+    sampler.ep_info_buffer = deque(maxlen=1)
+    sampler.ep_success_buffer = deque(maxlen=1)
+    sampler.rollout_buffer = model.rollout_buffer_class(
+        1, model.observation_space, model.action_space, model.device, n_envs=model.n_envs, **model.rollout_buffer_kwargs
+    )
+    sampler._last_episode_starts = np.zeros(model.n_envs, dtype=bool)
+    return sampler

@@ -87,6 +87,15 @@ def test_other_policies_and_arguments_pass(make):
     assert table.passed, table
 
 
+def test_a_baseline_that_is_nan_at_unused_steps_passes():
+    def baseline(rollout):
+        return th.full_like(rollout.returns, 3.0).masked_fill(~rollout.used, th.nan)
+
+    env = make_vec_env(corridor, 3, seed=0)
+    table = check_gradient(REINFORCE("MlpPolicy", env, baseline=baseline, n_episodes=4, device="cpu", seed=0))
+    assert table.passed, table
+
+
 class Magnified(Corridor):
     """Observations in the thousands."""
 

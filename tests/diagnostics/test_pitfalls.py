@@ -139,6 +139,12 @@ def test_the_natural_step_is_shortened_by_its_target(name, case):
     assert "ower target_kl" in sentence and "learning_rate" not in sentence
 
 
+def test_a_collapse_counts_the_updates_whose_divergence_is_unknown():
+    unknown = {"kl": np.nan}
+    sentence = PITFALLS["rate_too_large"](history(*seen({**spread, **unknown}, *[{**peaked, **unknown}] * 4)))
+    assert "within 5 updates" in sentence
+
+
 def test_a_spike_does_not_lengthen_the_natural_step():
     case = seen(*[{}] * 20, spike, max_grad_norm=None, step="natural")
     assert PITFALLS["spikes_without_clipping"](history(*case)) is None
