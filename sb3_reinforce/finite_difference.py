@@ -305,7 +305,10 @@ class FiniteDifference(BasePolicyGradient):
             self.end_round(None)
         callback.update_locals(locals())
         callback.on_rollout_end()
-        return GradientEstimate(gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched)
+        columns = th.cat(utility.columns) if self.common_random_numbers else None
+        return GradientEstimate(
+            gradient, th.cat(utility.candidates), th.cat(utility.values), delta_std, searched, columns
+        )
 
     def collect_part(self, callback: BaseCallback) -> None:
         # The utility evaluates this process's part of the perturbations, which all processes draw alike
@@ -322,7 +325,7 @@ class FiniteDifference(BasePolicyGradient):
         gradient = estimate.gradient
         searched = estimate.parameters
         utilities = estimate.utilities
-        fit = fit_quality(estimate.candidates, utilities, gradient)
+        fit = fit_quality(estimate.candidates, utilities, gradient, estimate.columns)
         utility_std = float(utilities.std(correction=0))
         self._update_learning_rate(self.policy.optimizer)
         if self.standardize_utilities:

@@ -99,6 +99,8 @@ class GradientEstimate:
     :param utilities: Their mean returns, shape ``(m,)``, float64
     :param delta_std: The scale of the perturbations
     :param parameters: The parameters of the policy that θ consists of, with n elements in all
+    :param columns: Of each candidate, the column of candidates that met the same episodes, shape ``(m,)``; None
+        without common random numbers
     """
 
     gradient: th.Tensor
@@ -106,6 +108,7 @@ class GradientEstimate:
     utilities: th.Tensor
     delta_std: float
     parameters: list[th.nn.Parameter]
+    columns: th.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -113,10 +116,11 @@ class Fit:
     """
     How well a gradient explains the utilities that it was estimated from.
 
-    :param r_squared: Share of their variance that ``u₀ + δ · ĝ`` explains; NaN where there is no variance
+    :param r_squared: Share of their variance within columns that ``u₀ + δ · ĝ`` explains; NaN where there is none
     :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
     :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None where the
-        evaluations do not determine every component and leave a degree of freedom
+        evaluations do not determine every component and leave a degree of freedom. Of forward differences, which share
+        the noise of U(θ), and with ``n_top`` the standard error is larger
     """
 
     r_squared: float
@@ -124,22 +128,30 @@ class Fit:
     standard_error: th.Tensor | None
 
 
-def fit_quality(candidates: th.Tensor, utilities: th.Tensor, gradient: th.Tensor) -> Fit:
+def fit_quality(
+    candidates: th.Tensor, utilities: th.Tensor, gradient: th.Tensor, columns: th.Tensor | None = None
+) -> Fit:
     """
-    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − 1 − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred θ + δ.
+    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − c − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred θ + δ.
+
+    Each of the c columns has its mean and its intercept u₀: candidates that met other episodes are not compared.
 
     :param candidates: Every θ + δ that was evaluated, shape ``(m, n)``, float64
     :param utilities: Their utilities, shape ``(m,)``, float64
     :param gradient: ĝ, shape ``(n,)``
+    :param columns: The column of each candidate, counted from 0, shape ``(m,)``; None for one column
     :return: The three of them
     """
-    x = candidates - candidates.mean(0)
-    y = utilities - utilities.mean()
+    if columns is None:
+        columns = th.zeros(len(utilities), dtype=th.long)
+    x = centred(candidates, columns)
+    y = centred(utilities[:, None], columns)[:, 0]
     residuals = y - x @ gradient
     # Both products have the rank of x; the smaller one is cheaper
     product = x @ x.T if len(x) < len(gradient) else x.T @ x
     rank = int(th.linalg.matrix_rank(product, hermitian=True))
-    degrees_of_freedom = len(y) - 1 - rank
+    n_columns = int((columns.bincount() > 0).sum())
+    degrees_of_freedom = len(y) - n_columns - rank
     squares = float(residuals @ residuals)
     total = float(y @ y)
     residual_std = (squares / degrees_of_freedom) ** 0.5 if degrees_of_freedom > 0 else float("nan")
@@ -149,6 +161,13 @@ def fit_quality(candidates: th.Tensor, utilities: th.Tensor, gradient: th.Tensor
         residual_std=residual_std,
         standard_error=residual_std * th.linalg.pinv(x).norm(dim=1) if is_determined else None,
     )
+
+
+def centred(x: th.Tensor, columns: th.Tensor) -> th.Tensor:
+    """Rows ``(m, n)`` less the mean of their column."""
+    counts = columns.bincount()
+    sums = x.new_zeros(len(counts), x.shape[1]).index_add_(0, columns, x)
+    return x - (sums / counts[:, None])[columns]
 
 
 ESTIMATORS: dict[str, Estimator] = {

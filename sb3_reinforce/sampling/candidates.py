@@ -76,15 +76,20 @@ class EpisodeTracker:
         return restarted
 
 
+def columns_of(shape: Sequence[int]) -> np.ndarray:
+    """The column of each candidate of a shape ``(m, k, n)``; candidates ``(k, n)`` are one column."""
+    n_columns = shape[1] if len(shape) == 3 else 1
+    columns: np.ndarray = np.arange(math.prod(shape[:-1])) % n_columns
+    return columns
+
+
 def seeds_of(shape: Sequence[int], n_episodes: int, first_seed: int) -> np.ndarray:
     """
     Seeds of the episodes of candidates of a shape ``(k, n)`` or ``(m, k, n)``, a row of ``n_episodes`` for each.
 
     Candidates ``(k, n)`` all have the same seeds; of ``(m, k, n)`` the m of a column have, as θ + δ and θ − δ.
     """
-    n_columns = shape[1] if len(shape) == 3 else 1
-    columns = np.arange(math.prod(shape[:-1])) % n_columns
-    return (first_seed + columns[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
+    return (first_seed + columns_of(shape)[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
 
 
 def evaluate_candidates(

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
-from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
+from sb3_reinforce.sampling.candidates import CandidateStep, columns_of, evaluate_candidates, seeds_of
 from sb3_reinforce.sampling.normalization import ObservationStatistics, set_training
 
 
@@ -23,7 +23,7 @@ class EpisodicUtility:
     """
     U(θ) = E[Σ_t r_t] by the episodes of one update of a FiniteDifference, whose seeds begin with ``first_seed``.
 
-    It keeps all candidates and their values; ``observed`` has the statistics of each frozen VecNormalize.
+    It keeps all candidates with their columns and values; ``observed`` has the statistics of each frozen VecNormalize.
     """
 
     model: Any
@@ -32,6 +32,7 @@ class EpisodicUtility:
     observed: list[ObservationStatistics]
     first_seed: int
     candidates: list[th.Tensor] = field(default_factory=list)
+    columns: list[th.Tensor] = field(default_factory=list)
     values: list[th.Tensor] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -63,6 +64,7 @@ class EpisodicUtility:
             returns = np.concatenate(processes.exchange(returns))
         values = th.as_tensor(returns).mean(1)
         self.candidates.append(thetas)
+        self.columns.append(th.as_tensor(columns_of(candidates.shape)))
         self.values.append(values)
         return values.reshape(candidates.shape[:-1])
 

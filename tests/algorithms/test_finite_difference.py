@@ -21,7 +21,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimation import ESTIMATORS, central_difference
+from sb3_reinforce.estimation import ESTIMATORS, central_difference, fit_quality
 from sb3_reinforce.estimation.perturbations import default_delta_std
 
 SMALL = dict(n_delta=3, estimator="central", seed=0, device="cpu")
@@ -43,6 +43,18 @@ class Line(gym.Env):
 
     def step(self, action):
         return self.state, -float((action[0] - 3 * self.state[0]) ** 2), True, False, {}
+
+
+class Levels(Line):
+    """The start decides most of the reward, 50 l + a, and the observation is 1."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.level = self.np_random.normal()
+        return np.ones(1, np.float32), {}
+
+    def step(self, action):
+        return np.ones(1, np.float32), 50 * self.level + float(action[0]), True, False, {}
 
 
 def estimates(n_updates, env=None, **kwargs):
@@ -86,6 +98,18 @@ def test_the_step_is_the_gradient_scaled_and_clipped(standardize, bound):
     assert logged["rollout/utility_std"] == pytest.approx(float(estimate.utilities.std(correction=0)))
     expected = step if bound is None else step * bound / norm
     th.testing.assert_close(model.theta - theta, expected, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("common_random_numbers", [True, False])
+@pytest.mark.parametrize("estimator", ["central", "regression"])
+def test_the_standard_error_is_the_spread_of_the_gradient(estimator, common_random_numbers):
+    kwargs = dict(n_delta=12, estimator=estimator, common_random_numbers=common_random_numbers, deterministic=False)
+    env = make_vec_env(Levels, 4, seed=0)
+    found = estimates(200, env, **kwargs)
+    errors = [fit_quality(each.candidates, each.utilities, each.gradient, each.columns) for each in found]
+    standard_error = th.stack([fit.standard_error for fit in errors]).square().mean().sqrt()
+    spread = th.stack([each.gradient for each in found]).std()
+    assert float(standard_error) == pytest.approx(float(spread), rel=0.2)
 
 
 def test_utilities_that_differ_by_rounding_make_no_step():

@@ -111,6 +111,17 @@ def test_policies_that_are_curved_much_pass(activation_fn):
     assert table["scores"].passed and table["surrogate"].passed, table
 
 
+@pytest.mark.parametrize("frozen", ["nothing", "action_net", "action_net mlp_extractor.policy_net"])
+@pytest.mark.parametrize("log_std_init", [-3.0, 0.0, 4.0])
+def test_scores_that_lie_mostly_in_the_standard_deviation_pass(log_std_init, frozen):
+    policy_kwargs = {"log_std_init": log_std_init}
+    model = REINFORCE("MlpPolicy", corridor(spaces.Box(-1, 1, (1,))), device="cpu", seed=0, policy_kwargs=policy_kwargs)
+    for name, parameter in model.policy.named_parameters():
+        parameter.requires_grad_(not name.startswith(tuple(frozen.split())))
+    table = check_gradient(model, 2)
+    assert table["sign"].passed, table
+
+
 @pytest.mark.parametrize(("n_channels", "memory_format"), [(1, th.contiguous_format), (3, th.channels_last)])
 def test_images_pass_with_a_bounded_number_of_them(monkeypatch, n_channels, memory_format):
     env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=n_channels, discrete=True)
@@ -286,6 +297,14 @@ def test_negation_is_seen_in_every_action_space():
     for action_space in ACTION_SPACES:
         model = REINFORCE(NEGATED, corridor(action_space), baseline="none", device="cpu", seed=0)
         assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
+
+
+@pytest.mark.parametrize("log_std_init", [-3.0, 4.0])
+def test_negation_is_seen_with_little_and_with_much_noise(log_std_init):
+    policy_kwargs = {"log_std_init": log_std_init}
+    env = corridor(spaces.Box(-1, 1, (2,)))
+    model = REINFORCE(NEGATED, env, baseline="none", device="cpu", seed=0, policy_kwargs=policy_kwargs)
+    assert check_gradient(model)["sign"].error == 1
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])

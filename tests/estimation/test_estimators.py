@@ -127,6 +127,24 @@ def test_fit_quality_is_a_textbook_regressions():
     th.testing.assert_close(fit.standard_error, (variance * th.linalg.inv(design.T @ design).diag()[1:]).sqrt())
 
 
+def test_fit_quality_compares_within_columns():
+    """Pairs that differ much between columns are the textbook's regression of their differences on 2Δ."""
+    k = 40
+    slope, deltas, noise, levels = (normal(*shape, seed=i) for i, shape in enumerate([(1, N), (k, N), (2, k), (1, k)]))
+    plus_and_minus = th.stack([deltas, -deltas])
+    utilities = 100 * levels + plus_and_minus @ slope[0] + 0.5 * noise
+    gradient = central_difference(lambda x: utilities, th.zeros(N).double(), deltas)
+    fit = fit_quality(plus_and_minus.reshape(-1, N), utilities.flatten(), gradient, th.arange(k).repeat(2))
+    differences = utilities[0] - utilities[1]
+    residuals = differences - 2 * deltas @ gradient
+    variance = residuals @ residuals / (k - N)
+    assert fit.residual_std == pytest.approx(float((variance / 2) ** 0.5))
+    assert fit.r_squared == pytest.approx(float(1 - residuals @ residuals / (differences @ differences)))
+    assert fit.standard_error is not None
+    covariance = variance * th.linalg.inv(4 * deltas.T @ deltas)
+    th.testing.assert_close(fit.standard_error, covariance.diag().sqrt())
+
+
 def test_fit_quality_without_degrees_of_freedom_or_variance_is_not_made_up():
     deltas = normal(3, N, seed=0)
     fit = fit_quality(deltas, th.ones(3).double(), th.zeros(N).double())
