@@ -77,9 +77,9 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
     - ``log_prob``: the log π that training differentiates is the log π of the sampled actions.
     - ``scores``: its gradient by autograd equals its gradient by finite differences.
-    - ``sign``: after a step along the score of an action, the policy samples it more often. For a Box, the density of
-      a Gaussian with the mean and the variance of its samples rises there. A policy that always samples the same
-      action cannot be checked, and does not pass.
+    - ``sign``: after a step along the score of an action, the policy samples it more often, or samples closer to it.
+      ``log_std`` is left out. A policy that always samples the same action, or learns nothing else than ``log_std``,
+      cannot be checked, and does not pass.
     - ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 

@@ -20,11 +20,9 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
-# Random directions in which scores are compared with differences, observations at which a sign is checked, and actions
-# of which the farthest is taken: a standard deviation away from the mean, a wide Gaussian has hardly a score
+# Random directions in which scores are compared with differences, and observations at which a sign is checked
 N_DIRECTIONS = 16
 N_ACTIONS = 8
-N_CANDIDATES = 64
 
 
 def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
@@ -164,7 +162,7 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
         one = take(obs, index[None])
         draws = draw(policy, one, n_draws)
         # The effect of a step is clearest for the action that is farthest from the rest
-        action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(N_CANDIDATES)]).argmin())]
+        action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
         before, after = closeness_after_step(policy, one, action, n_draws)
         if before < closeness(policy, action[None].expand_as(draws), action):
             # The count of a rare action may happen to stay the same
@@ -185,21 +183,23 @@ def draw(policy: ActorCriticPolicy, one: PyTorchObs, n: int) -> th.Tensor:
 
 
 def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:
-    """
-    The mean share of components that equal an action's, or for a Box the log density of a Gaussian with the moments of
-    the draws, but for a constant: a score may change the mean of what is sampled, or its spread.
-    """
+    """The mean share of components that equal an action's, or for a Box minus the distance of the mean to it."""
     if isinstance(policy.action_space, spaces.Box):
-        draws = draws.double()
-        variance = draws.var(0).clamp(min=1e-12)
-        density: th.Tensor = -((draws.mean(0) - action).square() / variance + variance.log()).sum() / 2
-        return density
+        distance: th.Tensor = (draws.mean(0) - action).norm()
+        return -distance
     return (draws == action).double().mean()
 
 
 def closeness_after_step(policy: ActorCriticPolicy, one: PyTorchObs, action: th.Tensor, n: int) -> th.Tensor:
-    """``closeness`` before and after a step along the score of an action, (2,), with the same n random draws."""
-    parameters = score_parameters(policy, one, action[None])
+    """
+    ``closeness`` before and after a step along the score of an action, (2,), with the same n random draws.
+
+    The score of ``log_std`` is left out: it changes the spread of the draws, and their mean only by chance.
+    """
+    found = score_parameters(policy, one, action[None])
+    parameters = [parameter for parameter in found if parameter is not getattr(policy, "log_std", None)]
+    if not parameters:
+        return th.zeros(2)
     log_prob = log_prob_of(policy, one, action[None])
     gradient = to_vector(th.autograd.grad(log_prob.sum(), parameters))
     theta = to_vector(parameters)

@@ -119,8 +119,8 @@ class Fit:
     :param r_squared: Share of their variance within columns that ``u₀ + δ · ĝ`` explains; NaN where there is none
     :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
     :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None where the
-        evaluations do not determine every component and leave a degree of freedom. Of forward differences, which share
-        the noise of U(θ), and with ``n_top`` the standard error is larger
+        evaluations do not determine every component and leave a degree of freedom. That of forward differences,
+        which share the noise of U(θ), is larger, and with ``n_top`` ĝ is another fit
     """
 
     r_squared: float

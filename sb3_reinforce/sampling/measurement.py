@@ -51,7 +51,8 @@ def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
 def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any] | None = None) -> Any:
     """
     A copy of a REINFORCE for measurements of whole episodes: it shares policy and environments, with its own log,
-    counters and rollouts. Without a baseline it has ``"value"`` with a critic, else ``"none"``.
+    counters and rollouts. ``collect_rollouts`` resets the environments first. Without a baseline it has ``"value"``
+    with a critic, else ``"none"``.
     """
     sampler = copy.copy(model)
     sampler.n_steps = None

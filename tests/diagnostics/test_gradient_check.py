@@ -111,15 +111,30 @@ def test_policies_that_are_curved_much_pass(activation_fn):
     assert table["scores"].passed and table["surrogate"].passed, table
 
 
-@pytest.mark.parametrize("frozen", ["nothing", "action_net", "action_net mlp_extractor.policy_net"])
-@pytest.mark.parametrize("log_std_init", [-3.0, 0.0, 4.0])
-def test_scores_that_lie_mostly_in_the_standard_deviation_pass(log_std_init, frozen):
-    policy_kwargs = {"log_std_init": log_std_init}
-    model = REINFORCE("MlpPolicy", corridor(spaces.Box(-1, 1, (1,))), device="cpu", seed=0, policy_kwargs=policy_kwargs)
+def with_noise(log_std_init, policy="MlpPolicy", n_actions=1):
+    env = corridor(spaces.Box(-1, 1, (n_actions,)))
+    return REINFORCE(policy, env, device="cpu", seed=0, policy_kwargs={"log_std_init": log_std_init})
+
+
+def without_gradient(model, *names):
     for name, parameter in model.policy.named_parameters():
-        parameter.requires_grad_(not name.startswith(tuple(frozen.split())))
-    table = check_gradient(model, 2)
+        parameter.requires_grad_(not name.startswith(names))
+    return model
+
+
+@pytest.mark.parametrize(
+    ("log_std_init", "frozen"),
+    [(-3.0, ()), (0.0, ()), (4.0, ()), (-3.0, ("action_net",)), (0.0, ("action_net",)), (4.0, ("mlp_extractor.",))],
+)
+def test_scores_that_lie_mostly_in_the_standard_deviation_pass(log_std_init, frozen):
+    table = check_gradient(without_gradient(with_noise(log_std_init), *frozen), 2)
     assert table["sign"].passed, table
+
+
+def test_the_sign_of_a_mean_that_is_not_trained_does_not_pass_unchecked():
+    table = check_gradient(without_gradient(with_noise(0.0), "action_net", "mlp_extractor.policy_net"), 2)
+    assert np.isnan(table["sign"].error)
+    assert "sign" in table.failures
 
 
 @pytest.mark.parametrize(("n_channels", "memory_format"), [(1, th.contiguous_format), (3, th.channels_last)])
@@ -299,12 +314,18 @@ def test_negation_is_seen_in_every_action_space():
         assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
 
 
-@pytest.mark.parametrize("log_std_init", [-3.0, 4.0])
-def test_negation_is_seen_with_little_and_with_much_noise(log_std_init):
-    policy_kwargs = {"log_std_init": log_std_init}
-    env = corridor(spaces.Box(-1, 1, (2,)))
-    model = REINFORCE(NEGATED, env, baseline="none", device="cpu", seed=0, policy_kwargs=policy_kwargs)
-    assert check_gradient(model)["sign"].error == 1
+class Mirrored(ActorCriticPolicy):
+    """Acts opposite to what it evaluates, with the log π of what it returns."""
+
+    def forward(self, obs, deterministic=False):
+        actions, values, _ = super().forward(obs, deterministic)
+        return -actions, values, self.evaluate_actions(obs, -actions)[1]
+
+
+@pytest.mark.parametrize("policy", [NEGATED, Mirrored])
+@pytest.mark.parametrize("log_std_init", [-3.0, 0.0, 2.0, 4.0])
+def test_a_wrong_sign_is_seen_with_little_and_with_much_noise(log_std_init, policy):
+    assert check_gradient(with_noise(log_std_init, policy, n_actions=2))["sign"].error == 1
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])
