@@ -267,8 +267,10 @@ class FiniteDifference(BasePolicyGradient):
 
         :param callback: Called at each step, and at the beginning and end of the rollout
         :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them
-        :raises ValueError: As ``learn``
+        :raises ValueError: As ``learn``, or if ``learn`` was never called
         """
+        if self.ep_info_buffer is None:
+            raise ValueError("estimate_gradient needs the counters and the log of learn(), which was never called")
         callback.on_rollout_start()
         # The user or a callback may have changed arguments
         self._check_arguments()

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
 from sb3_reinforce.diagnostics.sampling import env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
+from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.policies.parameters import read, searched_parameters
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
@@ -54,9 +55,9 @@ class CandidateUtility:
 
         :param thetas: Shape ``(k, n)``, or ``(m, k, n)``
         :return: Their utilities, shape ``(k,)`` or ``(m, k)``, float64
-        :raises ValueError: If a number is not finite, or an episode does not end
+        :raises ValueError: If the shape is another, a number is not finite, or an episode does not end
         """
-        candidates = thetas.reshape(-1, len(self.theta))
+        candidates = check_candidates("thetas must be", thetas, len(self.theta)).reshape(-1, len(self.theta))
         seeds = seeds_of(thetas.shape, self.n_episodes, self.seed)
         self.seed = int(seeds.max()) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)

@@ -19,7 +19,7 @@ except ModuleNotFoundError as error:
         "sb3_reinforce.diagnostics.plots needs matplotlib: pip install 'sb3-reinforce[plots]'"
     ) from error
 
-from sb3_reinforce.common.arguments import check_integer, check_number
+from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
 from sb3_reinforce.diagnostics.baseline_comparison import BaselineRow
 from sb3_reinforce.diagnostics.landscapes import Landscape
 from sb3_reinforce.diagnostics.tables import Table
@@ -43,6 +43,14 @@ def new_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 4.0)) -> Axes:
     return axes
 
 
+def arrays_of(name: str, given: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+    """The arrays of a dictionary with at least one."""
+    check_kind(name, given, (Mapping,), "a dictionary of arrays by name")
+    if not given:
+        raise ValueError(f"{name} must have at least one array, got none")
+    return {key: np.asarray(value, dtype=float) for key, value in given.items()}
+
+
 def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     """
     Plot the ratio of each baseline's variance to the reference's with its paired interval, and the floor as a line.
@@ -52,7 +60,9 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     :param table: The result of ``compare_baselines``
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
+    :raises TypeError: If ``table`` is no table
     """
+    check_kind("table", table, (Table,))
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]
     for y, row in enumerate(rows):
@@ -116,21 +126,24 @@ def plot_learning_curves(
     :param confidence: Probability with which an interval should cover the true value, at each point
     :param seed: Seed of the resamples
     :return: The Axes
-    :raises ValueError: If there are fewer than two runs, or the shapes do not match
+    :raises TypeError: If ``runs`` is no dictionary
+    :raises ValueError: If it is empty, there are fewer than two runs, or the shapes do not match
     """
-    ax = new_axes(ax)
     x = np.asarray(timesteps, dtype=float)
     check_integer("n_resamples", n_resamples, 1)
     check_number("confidence", confidence, 0, 1)
-    for index, (name, given) in enumerate(runs.items()):
-        scores = np.asarray(given, dtype=float)
+    check_integer("seed", seed, 0)
+    given = arrays_of("runs", runs)
+    for name, scores in given.items():
         if scores.ndim not in (2, 3) or len(scores) < 2 or scores.shape[-1:] != x.shape:
             raise ValueError(
                 f"runs[{name!r}] must be of shape (n_runs, n_points) or (n_runs, n_tasks, n_points), with at least 2 "
-                f"runs and n_points = {len(x)}, got {scores.shape}"
+                f"runs and n_points = {x.size}, got {scores.shape}"
             )
+    ax = new_axes(ax)
+    for index, (name, scores) in enumerate(given.items()):
         curve, low, high = interquartile_interval(
-            scores.reshape(len(scores), -1, len(x)), n_resamples, confidence, seed
+            scores.reshape(len(scores), -1, x.size), n_resamples, confidence, seed
         )
         (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
@@ -153,20 +166,22 @@ def plot_variances(
     :param ax: Axes to draw on; None for new ones
     :param confidence: Probability with which an interval should cover the true value
     :return: The Axes
-    :raises ValueError: If there are fewer than two repetitions, or the shapes do not match
+    :raises TypeError: If ``curves`` is no dictionary
+    :raises ValueError: If it is empty, there are fewer than two repetitions, or the shapes do not match
     """
-    ax = new_axes(ax)
     x = np.asarray(n_episodes, dtype=float)
     if check_number("confidence", confidence, 0, 1) == 1:
         raise ValueError("confidence must be below 1 for the intervals of a normal distribution, got 1")
     width = NormalDist().inv_cdf((1 + confidence) / 2)
-    for index, (name, given) in enumerate(curves.items()):
-        variances = np.asarray(given, dtype=float)
+    given = arrays_of("curves", curves)
+    for name, variances in given.items():
         if variances.ndim != 2 or len(variances) < 2 or variances.shape[1:] != x.shape:
             raise ValueError(
                 f"curves[{name!r}] must be of shape (n_repetitions, n_points), with at least 2 repetitions and "
                 f"n_points = {x.size}, got {variances.shape}"
             )
+    ax = new_axes(ax)
+    for index, (name, variances) in enumerate(given.items()):
         error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
         shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
         colour = COLOURS[index % len(COLOURS)]
@@ -189,7 +204,9 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :param scape: The result of ``landscape``
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
+    :raises TypeError: If ``scape`` is no ``Landscape``
     """
+    check_kind("scape", scape, (Landscape,))
     ax = new_axes(ax, (6.0, 6.6))
     # Half a step beyond the outer points, which are the centres of pixels
     end = scape.scales[-1] * (1 + 1 / (len(scape.scales) - 1))

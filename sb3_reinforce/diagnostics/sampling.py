@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.common.arguments import check_integer, check_kind
+from sb3_reinforce.common.arguments import check_flag, check_integer, check_kind
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import by_step, compute_weights
 from sb3_reinforce.reinforce import REINFORCE
@@ -38,13 +38,13 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progr
     """
     check_model(model)
     collector = sampling_copy(model, check_integer("n_episodes", n_episodes, 2), baseline)
-    with undisturbed(model), episode_bar(progress_bar, n_episodes) as bar:
+    with episode_bar(progress_bar, n_episodes) as bar, undisturbed(model):
         return collect_episodes(collector, bar)
 
 
 def episode_bar(progress_bar: bool, n_episodes: int | None = None) -> AbstractContextManager[Any]:
     """A progress bar that counts episodes, or None; only the bar needs tqdm."""
-    if not progress_bar:
+    if not check_flag("progress_bar", progress_bar):
         return nullcontext()
     from tqdm import tqdm
 

@@ -95,7 +95,7 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
     seeds = th.randint(2**31, (n_starts,)).numpy().repeat(N_PER_START)
     rollouts = []
     firsts = []
-    with undisturbed(model), episode_bar(progress_bar, len(seeds)) as bar:
+    with episode_bar(progress_bar, len(seeds)) as bar, undisturbed(model):
         # Pending seeds would replace the seeds of the first episodes
         env.reset()
         for part in seeds.reshape(-1, env.num_envs):

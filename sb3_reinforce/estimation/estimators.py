@@ -28,8 +28,9 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises ValueError: If all perturbations are zero
+    :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
+    check_deltas(theta, deltas)
     check_design(deltas, deltas)
     utilities = utility(th.cat([theta[None], theta + deltas]))
     return solve(deltas, utilities[1:] - utilities[0])
@@ -45,8 +46,9 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
         section 3.3), which biases ĝ towards them; None for all
     :return: ĝ, shape ``(n,)``
-    :raises ValueError: If all perturbations are zero
+    :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
+    check_deltas(theta, deltas)
     check_design(deltas, deltas)
     utilities = utility(th.stack([theta + deltas, theta - deltas]))
     top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
@@ -65,12 +67,22 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises ValueError: If all perturbations are equal
+    :raises ValueError: If Δ does not fit θ, or all perturbations are equal
     """
+    check_deltas(theta, deltas)
     design = deltas - deltas.mean(0)
     check_design(design, deltas)
     utilities = utility(theta + deltas)
     return solve(design, utilities - utilities.mean())
+
+
+def check_deltas(theta: th.Tensor, deltas: th.Tensor) -> None:
+    """Check that perturbations are rows like θ, and finite."""
+    if deltas.ndim != 2 or len(deltas) == 0 or deltas.shape[1:] != theta.shape or not deltas.isfinite().all():
+        raise ValueError(
+            f"deltas must be finite numbers of shape (k, n), with k > 0 and n = {len(theta)} parameters of theta, got "
+            f"shape {tuple(deltas.shape)}: {deltas}"
+        )
 
 
 def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
@@ -85,7 +97,7 @@ def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
 def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
     """``ĝ = argmin ‖design · ĝ − differences‖²`` of least norm, for a design ``(k, n)`` and differences ``(k,)``."""
     # By the singular value decomposition: the normal equations would square the condition of the design
-    gradient: th.Tensor = th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
+    gradient: th.Tensor = th.linalg.lstsq(design.to(differences), differences[:, None], driver="gelsd").solution[:, 0]
     return gradient
 
 
@@ -177,15 +189,17 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def check_candidates(candidates: Any, n_parameters: int) -> th.Tensor:
-    """Return what an estimator calls the utility with, ``(k, n)`` or ``(m, k, n)``, in float64 if it is finite."""
+def check_candidates(must: str, candidates: Any, n_parameters: int) -> th.Tensor:
+    """Return candidates of a utility, ``(k, n)`` or ``(m, k, n)``, in float64; ``must`` begins the error's sentence."""
     shape = tuple(candidates.shape) if isinstance(candidates, th.Tensor) else ()
-    if len(shape) not in (2, 3) or shape[-1] != n_parameters:
+    is_shaped = len(shape) in (2, 3) and 0 not in shape and shape[-1] == n_parameters
+    if not is_shaped or not candidates.isfinite().all():
         raise ValueError(
-            f"candidates must be a tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), but the estimator "
-            f"called the utility with {shape or candidates!r}"
+            f"{must} a finite tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), got shape {shape}: "
+            f"{candidates!r}"
         )
-    return check_tensor("estimator", candidates, shape)
+    result: th.Tensor = candidates.detach().to("cpu", th.float64)
+    return result
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:

@@ -51,11 +51,15 @@ def gradients_by_episode(
     :param chunk: Floats that an intermediate result may take; the result does not depend on it
     :param columns: The components of θ to return, n in number
     :return: Shape ``(k, m, n)``, in the dtype and on the device of the parameters; the episodes are in ascending order
-    :raises ValueError: If there are no weights, or log π does not depend on any parameter in a way that can be
-        differentiated
+    :raises ValueError: If there are no weights or they have another shape, or log π does not depend on any parameter
+        in a way that can be differentiated
     """
-    if not weights:
-        raise ValueError("weights must hold at least one tensor of the shape of rollout.used, got none")
+    shape = rollout.used.shape
+    wrong = [weight for weight in weights if not isinstance(weight, th.Tensor) or weight.shape != shape]
+    if wrong or not weights:
+        got = wrong[0] if wrong else "none"
+        raise ValueError(f"weights must be tensors of the shape of rollout.used, {tuple(shape)}, got {got}")
+
     parameters = parameters_of(rollout)
     w = th.stack([select(weight, rollout.used) for weight in weights]).to(parameters[0])
     _, episode = th.unique(rollout.episodes[rollout.used], return_inverse=True)

@@ -46,7 +46,8 @@ class EpisodicUtility:
         """The mean returns of candidates ``(k, n)``, or ``(m, k, n)`` if only those in one column share seeds."""
         model = self.model
         n_episodes = model.n_eval_episodes
-        thetas = check_candidates(candidates, self.n_parameters).reshape(-1, self.n_parameters)
+        checked = check_candidates("estimator must call the utility with", candidates, self.n_parameters)
+        thetas = checked.reshape(-1, self.n_parameters)
         seeds = seeds_of(candidates.shape, n_episodes, self.first_seed)
         processes = model._processes
         # Each process evaluates a part of the candidates

@@ -135,7 +135,9 @@ def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.N
             utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env), *which)
     except (AssertionError, ValueError) as error:
         if command == "record_video" or given.algo in ALGORITHMS or "rl-trained-agents" not in given.folder:
-            parser.error(f"{error}: pass the folder of your models, such as -f logs, and their --algo and --env")
+            parser.error(
+                f"{error}: pass the folder of your models, such as -f logs, their --algo and --env, or an --exp-id"
+            )
 
 
 def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ import importlib
 import re
 import runpy
 from collections import OrderedDict
+from collections.abc import Iterator
 from pathlib import Path
 from pprint import pprint
 from typing import Any, get_args
@@ -12,8 +13,9 @@ import gymnasium as gym
 import rl_zoo3
 import yaml
 from gymnasium import spaces
-from rl_zoo3 import exp_manager
+from rl_zoo3 import exp_manager, utils
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -39,6 +41,8 @@ ZOO_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device"}
 # In a configuration, a section by environment: the entries keep to the keys of the Zoo and the arguments of the
 # algorithm, so that other scripts can read them
 TRAIN_ENV_KWARGS = "train_env_kwargs"
+# Settings that name classes by their path
+CLASS_KEYS = ("policy", "env_wrapper", "vec_env_wrapper", "callback")
 # Settings whose dict may be given as a text
 PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
 LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
@@ -78,7 +82,7 @@ class Experiment(exp_manager.ExperimentManager):
         except (AssertionError, TypeError, ValueError) as error:
             # Stable-Baselines3 asserts that a policy supports the spaces; errors about an argument name it at these
             # places; all other errors keep their traceback
-            named = re.findall(r"(?:^|, got |unexpected keyword argument ')(\w+)", str(error))
+            named = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
             if isinstance(error, AssertionError) or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
@@ -101,9 +105,9 @@ class Experiment(exp_manager.ExperimentManager):
         check_hyperparams(self.algo, found)
         keywords = {
             key: as_dict(key, found.get(key))
-            for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", TRAIN_ENV_KWARGS)
+            for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", "normalize", TRAIN_ENV_KWARGS)
         }
-        for names in keywords.values():
+        for names in (*keywords.values(), *(names for _, _, names in classes_of(found))):
             self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
@@ -163,6 +167,7 @@ def load_configuration(config: str) -> Any:
 def fit_default(default: Settings, experiment: Experiment) -> Settings:
     """Leave out the settings that do not go with the spaces of the environment, and use a policy that does."""
     given = {**default, **(experiment.custom_hyperparams or {})}
+    check_hyperparams(experiment.algo, given)
     env = gym.make(experiment.env_name.gym_id, **(experiment.env_kwargs or given.get("env_kwargs") or {}))
     wrap = rl_zoo3.get_wrapper_class(given)
     env = wrap(env) if wrap else env
@@ -208,17 +213,32 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
                 raise ConfigurationError(f"{key} is the text {value!r}, as YAML reads it: write !!float {value}")
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
-    as_dict("monitor_kwargs", hyperparams.get("monitor_kwargs"))
-    if not isinstance(hyperparams.get("normalize"), bool):
-        as_dict("normalize", hyperparams.get("normalize"))
+    for key, path, _ in classes_of(hyperparams):
+        try:
+            utils.get_class_by_name(path)
+        except (AttributeError, ValueError) as error:
+            raise ConfigurationError(f"{key} must be the path of a class, got {path!r}: {error}") from error
+    for key in ("monitor_kwargs", "normalize"):
+        as_dict(key, hyperparams.get(key))
     for key in ("n_envs", "frame_stack"):
         check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
 
 
+def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
+    """Each path of a class that the Zoo will import, with its setting before and its keyword arguments after it."""
+    for key in CLASS_KEYS:
+        given = hyperparams.get(key)
+        for each in given if isinstance(given, list) else [given]:
+            path, names = next(iter(each.items())) if isinstance(each, dict) and each else (each, {})
+            is_name = key == "policy" and "." not in str(path)
+            if not (is_name or path is None or isinstance(path, (type, BaseCallback))):
+                yield key, path, as_dict(key, names)
+
+
 def as_dict(key: str, value: Any) -> Settings:
     """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
-    result = {} if value is None else value
+    result = {} if value is None or (key == "normalize" and isinstance(value, bool)) else value
     if isinstance(value, str) and key in PYTHON_KEYS:
         try:
             result = eval(value, dict(vars(exp_manager)))

@@ -64,6 +64,12 @@ def estimates(n_updates, env=None, **kwargs):
     return [model.estimate_gradient(callback) for _ in range(n_updates)]
 
 
+def test_an_estimate_before_learn_is_refused():
+    model = make(Line())
+    with pytest.raises(ValueError, match=r"estimate_gradient needs the counters and the log of learn\(\)"):
+        model.estimate_gradient(Record(lambda model: None))
+
+
 def test_the_gradient_is_the_estimator_applied_to_the_utility():
     (estimate,) = estimates(1, n_delta=4)
     theta = estimate.candidates.mean()
@@ -322,7 +328,8 @@ def test_a_perturbation_and_an_estimator_of_the_user():
         (dict(estimator=lambda u, t, d: 3.0), r"estimator must return a tensor of shape \(8,\), got 3.0"),
         (dict(estimator=lambda u, t, d: t * np.nan), "estimator must return finite numbers"),
         (dict(estimator=lambda u, t, d: t), "estimator must call the utility at least once"),
-        (dict(estimator=lambda u, t, d: u(t)), r"candidates must be a tensor of shape \(k, 8\) or \(m, k, 8\)"),
+        (dict(estimator=lambda u, t, d: u(t)), r"estimator must call the utility with a finite tensor of .*\(8,\)"),
+        (dict(estimator=lambda u, t, d: u(d / 0)), "estimator must call the utility with a finite tensor"),
         (dict(perturbation=lambda k, n, g: th.ones(n, k)), r"perturbation must return a tensor of shape \(3, 8\)"),
         (dict(perturbation=lambda k, n, g: th.full((k, n), th.inf)), "perturbation must return finite numbers"),
         (dict(perturbation=lambda k, n, g: th.zeros(k, n)), "no usable direction"),

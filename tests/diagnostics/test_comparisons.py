@@ -144,6 +144,15 @@ def test_a_progress_bar_counts_the_episodes(capsys):
         assert f"| {shown} [" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("measure", [compare_baselines, compare_starts, sample])
+def test_a_wrong_progress_bar_is_named_before_anything_is_sampled(measure):
+    model = REINFORCE("MlpPolicy", make_vec_env(lambda: Tree(), 2, seed=0), device="cpu").learn(8)
+    before = model._last_obs
+    with pytest.raises(TypeError, match="progress_bar must be True or False, got 'x'"):
+        measure(model, 6, progress_bar="x")
+    assert model._last_obs is before
+
+
 def test_bias_is_told_where_theory_knows_it():
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
     assert [table[name].bias for name in ("none", "leave_one_out", "value", "optimal")] == [0, 0, 0, 0]

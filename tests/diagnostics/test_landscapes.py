@@ -146,6 +146,18 @@ def test_candidates_share_their_starts_and_calls_do_not():
     assert th.equal(pairs[0], pairs[1]) and len(pairs[0].unique()) == 2
 
 
+@pytest.mark.parametrize("shape", [(8,), (8, 1), (0, 8), (1, 1, 2, 8)])
+def test_candidates_of_another_shape_are_named_before_they_play(shape):
+    model = REINFORCE("MlpPolicy", Corridor((2, 9)), policy_kwargs={"net_arch": []}, device="cpu").learn(4)
+    before = model._last_obs
+    utility = CandidateUtility(model, 1, seed=0)
+    n = len(utility.theta)
+    wrong = th.zeros([n if size == 8 else size for size in shape])
+    with pytest.raises(ValueError, match=rf"thetas must be a finite tensor of shape \(k, {n}\)"):
+        utility(wrong)
+    assert n > 1 and model._last_obs is before
+
+
 def test_directions_are_normalized_filter_by_filter():
     like = [th.nn.Parameter(th.randn(3, 4)), th.nn.Parameter(th.randn(3))]
     direction = filter_normalized(th.randn(15, dtype=th.float64), like)
@@ -215,6 +227,25 @@ def test_curves_of_a_single_run_are_refused():
             plots.plot_variances({"a": wrong}, np.arange(1, 9))
     with pytest.raises(ValueError, match="confidence must be below 1"):
         plots.plot_variances({"a": np.ones((3, 8))}, np.arange(1, 9), confidence=1)
+
+
+@pytest.mark.parametrize(
+    ("plot", "arguments", "named"),
+    [
+        (plots.plot_baselines, (3,), "table must be Table, got 3"),
+        (plots.plot_landscape, (3,), "scape must be Landscape, got 3"),
+        (plots.plot_learning_curves, ([1], [1]), "runs must be a dictionary"),
+        (plots.plot_learning_curves, ({}, [1]), "runs must have at least one array"),
+        (plots.plot_learning_curves, ({"a": [[1]]}, [1]), r"runs\['a'\]"),
+        (plots.plot_variances, ({}, [1]), "curves must have at least one array"),
+        (plots.plot_variances, ({"a": [[1]]}, [1]), r"curves\['a'\]"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named_and_leaves_no_figure(plot, arguments, named):
+    plots.plt.close("all")
+    with pytest.raises((TypeError, ValueError), match=named):
+        plot(*arguments)
+    assert not plots.plt.get_fignums()
 
 
 def test_baselines_without_variance_are_drawn(tmp_path):

@@ -111,6 +111,25 @@ def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(nam
         ESTIMATORS[name](utility, th.zeros(N).double(), equal)
 
 
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("shape", [(4, N + 1), (0, N), (N,), None])
+def test_perturbations_that_do_not_fit_theta_are_an_error_before_anything_is_evaluated(name, shape):
+    deltas = th.full((4, N), th.nan) if shape is None else th.rand(shape)
+    with pytest.raises(ValueError, match=rf"deltas must be .* n = {N} parameters"):
+        ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N).double(), deltas.double())
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_perturbations_may_be_of_another_precision(name):
+    theta, deltas = th.zeros(N).double(), normal(2 * N, N, seed=0).float()
+
+    def utility(x):
+        return x.exp().sum(-1)
+
+    expected = ESTIMATORS[name](utility, theta, deltas.double())
+    th.testing.assert_close(ESTIMATORS[name](utility, theta, deltas), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_fit_quality_is_a_textbook_regressions():
     m = 400
     slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]

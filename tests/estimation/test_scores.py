@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch as th
 from environments import Corridor
@@ -114,9 +115,10 @@ def test_a_policy_without_a_gradient_is_named():
         gradients_by_episode(replace(rollout, policy=detached), rollout.returns)
 
 
-def test_missing_weights_are_named():
-    with pytest.raises(ValueError, match="weights must hold at least one tensor"):
-        gradients_by_episode(collect(Corridor((2, 9))))
+@pytest.mark.parametrize("wrong", [(), (1.0,), (th.ones(3),), (np.ones((11, 1)),)])
+def test_wrong_weights_are_named(wrong):
+    with pytest.raises(ValueError, match=r"weights must be tensors of the shape of rollout.used, \(\d+, 1\), got"):
+        gradients_by_episode(collect(Corridor((2, 9))), *wrong)
 
 
 @pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "action_net.bias", "log_std"])

@@ -186,6 +186,13 @@ SETTINGS = [
     ("train_env_kwargs: 3", "train_env_kwargs must be a dict, got 3"),
     ("train_env_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
     ("monitor_kwargs: {gravty: 3}", "unexpected keyword argument 'gravty'"),
+    ("policy: sb3_reinforce.MaskdPolicy", "policy must be the path of a class, got 'sb3_reinforce.MaskdPolicy'"),
+    ("env_wrapper: Nope", "env_wrapper must be the path of a class, got 'Nope'"),
+    ("vec_env_wrapper: [3]", "vec_env_wrapper must be the path of a class, got 3"),
+    ("callback: sb3_reinforce.Nope", "callback must be the path of a class, got 'sb3_reinforce.Nope'"),
+    ("env_wrapper: [{gymnasium.wrappers.RescaleAction: {low: 1}}]", "unexpected keyword argument 'low'"),
+    ("normalize: {norm_ob: true}", "unexpected keyword argument 'norm_ob'"),
+    ("normalize: {norm_obs_keys: [x]}", "`norm_obs_keys` param is applicable only with"),
     ("use_sde: true", "use_sde=True is for Box action spaces"),
     ("frame_stack: a", "frame_stack must be an integer, got 'a'"),
 ]
@@ -228,6 +235,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
         (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
+        ([*REINFORCE, "--env", "Taxi-v4", "-params", "env_wrapper:'Nope'"], "env_wrapper must be the path of a class"),
         ([*REINFORCE, "--device", "gpu9"], "device must be 'auto' or a device that PyTorch knows, got 'gpu9'"),
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         # A temperature in the default entry is left out, but not one that was asked for
