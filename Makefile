@@ -20,7 +20,7 @@ check: lint type test
 tables:
 	python docs/_ext/fill_tables.py
 
-# Executes the lesson's pages whose code has changed; SPHINXOPTS="-D nb_execution_mode=off" executes none
+# Executes the tutorial's pages whose code has changed; SPHINXOPTS="-D nb_execution_mode=off" executes none
 docs:
 	python -m sphinx -W --keep-going -q -d docs/_build/doctrees $(SPHINXOPTS) docs docs/_build/html
 	python docs/_ext/check_html.py docs/_build/html

@@ -28,7 +28,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath"]
 html_math_renderer = "mathml"
 myst_heading_anchors = 3
 
-# The lesson's pages are examples/*.py. A page is executed again only when its code has changed
+# The tutorial's pages are examples/*.py. A page is executed again only when its code has changed
 lesson.copy_pages(HERE.parent / "examples", HERE / "lesson")
 nb_custom_formats = {".py": "lesson.read"}
 nb_execution_mode = "cache"

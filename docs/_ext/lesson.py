@@ -1,4 +1,4 @@
-"""The lesson's pages: the scripts of ``examples/`` in jupytext's percent format."""
+"""The tutorial's pages: the scripts of ``examples/`` in jupytext's percent format."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ def copy_pages(source: Path, target: Path) -> None:
     for path in source.glob("[0-9]*.py"):
         text = path.read_text()
         if re.search(r"^# %% \[markdown\]", text, re.MULTILINE):
-            # With two digits, the order of the names is the order of the lesson
+            # With two digits, the order of the names is the order of the tutorial
             number, _, name = path.name.partition("_")
             pages[f"{int(number):02}_{name}"] = text + links(f"{int(number):02}_{name}", path.name)
     for name, text in pages.items():

@@ -66,28 +66,6 @@ def seconds() -> str:
     return markdown(["task", "REINFORCE", "A2C", "PPO"], lines)
 
 
-def machines() -> str:
-    """The same seeds on an earlier and on a later machine, where the returns differ."""
-    lines = [
-        [f"{task} ({short(budget)})", *(counted(runs[column]) for column in ("earlier", "later"))]
-        for task, budget, runs in by_task(read("machines"))
-    ]
-    return markdown(["task (steps)", "earlier machine [seeds]", "later machine"], lines)
-
-
-def searches() -> str:
-    """FiniteDifference and ARS by the comparison's own protocol."""
-    rows = final("comparison_others")
-    lines = []
-    for (task, budget), runs in rows[rows["algorithm"] == "finite_difference"].groupby(["task", "budget"], sort=False):
-        cells = []
-        for name in ("finite_difference", "ars"):
-            same = rows[(rows["task"] == task) & (rows["algorithm"] == name)]
-            cells += [spread(same["return"]), number(same["cpu_seconds"].median(), 0)]
-        lines.append([f"{task} ({short(budget)})", str(runs["seed"].nunique()), *cells])
-    return markdown(["task (steps)", "seeds", "FiniteDifference", "seconds", "ARS", "seconds"], lines)
-
-
 def readme() -> str:
     """The README's small table."""
     rows = final("comparison", "comparison_others").groupby(["task", "budget"])
@@ -165,19 +143,6 @@ def common_random_numbers() -> str:
     return markdown(["environment", "estimators", "variance without / with", "steps with / without"], lines)
 
 
-def noise_scale() -> str:
-    """The returns with each fixed number of episodes, and with the noise scale as the number."""
-    rows = read("noise_scale")
-    sizes = list(rows["n_episodes"].unique())
-    lines = []
-    for task, budget, runs in by_task(rows):
-        cells = [spread(runs.loc[runs["n_episodes"] == size, "return"], 0) for size in sizes]
-        chosen = runs.loc[runs["n_episodes"] == "noise_scale", "mean_episodes"].median()
-        lines.append([f"{task} ({short(budget)})", *cells, f"{chosen:.0f}"])
-    header = [size.replace("_", " ") for size in sizes]
-    return markdown(["task (steps)", *header, "mean size of its rollouts"], lines)
-
-
 def search_throughput() -> str:
     """Gradients a second beside ARS."""
     lines = [
@@ -205,7 +170,7 @@ def peers() -> str:
     for name, runs in rows.groupby("contender", sort=False):
         ratio = (rates["REINFORCE"] / rates[name]).median()
         lines.append([name, f"{ratio:.1f}", *(number(runs[column].median(), 0) for column in ("steps", "seconds"))])
-    return markdown(["", "REINFORCE's steps/s ÷ this one's", "steps to the return", "CPU seconds"], lines)
+    return markdown(["", "REINFORCE's steps/s ÷ theirs", "steps to the return", "CPU seconds"], lines)
 
 
 def images(device: str = "cpu") -> str:
