@@ -34,31 +34,31 @@ def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Check that a policy of Stable-Baselines3 can act in these spaces."""
-    check_space("action space", action_space, "Box, Discrete, MultiDiscrete or MultiBinary")
+    check_space("action_space", action_space, "Box, Discrete, MultiDiscrete or MultiBinary")
     if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
-        raise ValueError(f"A Box action space must have finite bounds, got {action_space}")
+        raise ValueError(f"action_space must have finite bounds, got {action_space}")
     if isinstance(action_space, spaces.MultiBinary) and not isinstance(action_space.n, int):
-        raise ValueError(f"A MultiBinary action space must have one dimension, got {action_space}: flatten it")
+        raise ValueError(f"action_space must have one dimension, got {action_space}: flatten it")
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
     if not parts:
-        raise ValueError(f"The observation space must not be empty, got {observation_space}")
+        raise ValueError(f"observation_space must not be empty, got {observation_space}")
     for key, space in parts.items():
-        name = f"observation space under {key!r}" if key else "observation space"
+        name = f"observation_space[{key!r}]" if key else "observation_space"
         check_space(name, space, "Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these")
         if isinstance(space, spaces.Box) and not space.shape:
-            raise ValueError(f"The {name} must have a dimension, got {space}: make its shape (1,)")
+            raise ValueError(f"{name} must have a dimension, got {space}: make its shape (1,)")
         if np.any(getattr(space, "start", 0)):
-            raise ValueError(f"The {name} must start at 0, got {space}: subtract its start")
+            raise ValueError(f"{name} must start at 0, got {space}: subtract its start")
 
 
 def check_space(name: str, space: spaces.Space[Any], supported: str) -> None:
     """Check what action and observation spaces have in common."""
     if not isinstance(space, SUPPORTED):
-        raise ValueError(f"The {name} must be {supported}, got {space}")
+        raise ValueError(f"{name} must be {supported}, got {space}")
     if isinstance(space, spaces.MultiDiscrete) and len(space.shape) != 1:
-        raise ValueError(f"The MultiDiscrete {name} must have one dimension, got {space}: flatten it")
+        raise ValueError(f"{name} must have one dimension, got {space}: flatten it")
     if 0 in (space.shape or ()):
-        raise ValueError(f"The {name} must not be empty, got {space}")
+        raise ValueError(f"{name} must not be empty, got {space}")
 
 
 def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarray]:

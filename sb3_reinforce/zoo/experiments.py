@@ -68,7 +68,7 @@ class Experiment(exp_manager.ExperimentManager):
     def __init__(self, *arguments: Any, **kwargs: Any):
         super().__init__(*arguments, **kwargs)
         self.model_config: Path | None = None
-        self.argument_names = allowed_keys(self.algo) | ZOO_ARGUMENTS
+        self.argument_names = allowed_keys(self.algo) | ZOO_ARGUMENTS | {"observation_space", "action_space"}
         if kwargs.get("config") is None:
             self.config = str(HYPERPARAMS / f"{self.algo}.yml")
             written = Path(self.trained_agent).parent / self.env_name / "config.yml"

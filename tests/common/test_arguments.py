@@ -391,28 +391,28 @@ def test_integers_of_numpy(kind, tmp_path):
 @pytest.mark.parametrize(
     ("name", "space", "problem"),
     [
-        ("observation_space", spaces.Box(0, 1, (3, 0)), "must not be empty"),
-        ("observation_space", spaces.Dict({}), "must not be empty"),
-        ("observation_space", spaces.Dict(a=spaces.Box(0, 1, (0,))), "under 'a' must not be empty"),
-        ("observation_space", spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
-        ("observation_space", spaces.Text(3), "must be Box"),
-        ("observation_space", spaces.Discrete(4, start=2), "must start at 0"),
-        ("observation_space", spaces.MultiDiscrete([2, 2], start=[0, 1]), "must start at 0"),
-        ("observation_space", spaces.Box(-1, 1, ()), "must have a dimension"),
-        ("observation_space", spaces.Dict(x=spaces.Box(-1, 1, ())), "under 'x' must have a dimension"),
-        ("observation_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
-        ("action_space", spaces.Box(-1, 1, (0,)), "must not be empty"),
-        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "must have finite bounds"),
-        ("action_space", spaces.MultiBinary([2, 3]), "must have one dimension"),
-        ("action_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), "must have one dimension"),
-        ("action_space", spaces.Tuple([spaces.Discrete(2)]), "must be Box"),
-        ("action_space", spaces.Dict(a=spaces.Discrete(2)), "must be Box"),
+        ("observation_space", spaces.Box(0, 1, (3, 0)), " must not be empty"),
+        ("observation_space", spaces.Dict({}), " must not be empty"),
+        ("observation_space", spaces.Dict(a=spaces.Box(0, 1, (0,))), r"\['a'\] must not be empty"),
+        ("observation_space", spaces.Tuple([spaces.Discrete(2)]), " must be Box"),
+        ("observation_space", spaces.Text(3), " must be Box"),
+        ("observation_space", spaces.Discrete(4, start=2), " must start at 0"),
+        ("observation_space", spaces.MultiDiscrete([2, 2], start=[0, 1]), " must start at 0"),
+        ("observation_space", spaces.Box(-1, 1, ()), " must have a dimension"),
+        ("observation_space", spaces.Dict(x=spaces.Box(-1, 1, ())), r"\['x'\] must have a dimension"),
+        ("observation_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), " must have one dimension"),
+        ("action_space", spaces.Box(-1, 1, (0,)), " must not be empty"),
+        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), " must have finite bounds"),
+        ("action_space", spaces.MultiBinary([2, 3]), " must have one dimension"),
+        ("action_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), " must have one dimension"),
+        ("action_space", spaces.Tuple([spaces.Discrete(2)]), " must be Box"),
+        ("action_space", spaces.Dict(a=spaces.Discrete(2)), " must be Box"),
     ],
 )
 def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
     env = Corridor()
     setattr(env, name, space)
-    with pytest.raises(ValueError, match=f"{name.replace('_', ' ')} {problem}"):
+    with pytest.raises(ValueError, match=f"^{name}{problem}"):
         make(kind, env, "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy")
 
 

@@ -236,6 +236,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "--env", "Taxi-v4", "-params", "env_wrapper:'Nope'"], "env_wrapper must be the path of a class"),
+        ([*REINFORCE, "--env", "Blackjack-v1"], "observation_space must be Box, Discrete, MultiDiscrete, "),
         ([*REINFORCE, "--device", "gpu9"], "device must be 'auto' or a device that PyTorch knows, got 'gpu9'"),
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         # A temperature in the default entry is left out, but not one that was asked for
