@@ -57,7 +57,7 @@ def make_model(episodes_per_start, seed):
 # starts, and the factor by which groups reduce the gradient's variance. Below 1, they add noise.
 
 # %%
-report = compare_starts(make_model(1, seed))
+report = compare_starts(make_model(1, seed), seed=seed)
 print(report)
 assert report.share.low > 0.5
 assert report.gains[8].low > 1
@@ -65,7 +65,8 @@ assert report.gains[8].low > 1
 # %% [markdown]
 # ## Both at the same number of episodes
 #
-# All policies are evaluated on the same 320 days. The best one drives to the nearest depot.
+# Groups of four and of eight gain about the same: larger groups have a better baseline, but fewer starts. All policies
+# are evaluated on the same 320 days. The best one drives to the nearest depot.
 
 
 # %%

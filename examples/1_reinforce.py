@@ -12,10 +12,12 @@
 # and takes one step along it. $G_t$ is the sum of the rewards from step $t$ on and $b_t$ a baseline: here the mean of
 # $G_t$ over the other episodes that reach step $t$.
 #
-# Why the scores $\nabla_\theta \log \pi_\theta$? For the probability $p_\theta$ of an episode, $\nabla p_\theta =
-# p_\theta \nabla \log p_\theta$, so the gradient of an expectation is an expectation too:
+# Why the scores $\nabla_\theta \log \pi_\theta$? For the probability $p_\theta$ of an episode,
+# $\nabla p_\theta = p_\theta \nabla \log p_\theta$, so the gradient of an expectation is an expectation too:
 # $\nabla \sum p_\theta \cdot \text{return} = E[\text{return} \cdot \nabla \log p_\theta]$. The dynamics of the cart
-# do not depend on $\theta$ and drop out of $\nabla_\theta \log p_\theta$. Only the scores remain.
+# do not depend on $\theta$ and drop out of $\nabla_\theta \log p_\theta$. Only the scores remain. $G_t$ may replace the
+# return, since an action does not change earlier rewards (page 5), and $b_t$ may be subtracted, since scores have mean
+# zero (page 2).
 
 # %%
 import torch as th
@@ -30,9 +32,9 @@ th.set_num_threads(1)
 
 # %% [markdown]
 # Whole episodes, no critic, one policy step per 16 episodes. The policy is Stable-Baselines3's `MlpPolicy`. By default
-# Adam takes the step, the sum is divided by the number of steps instead of $N$, and rewards are discounted with 0.99
-# (page 5 shows what that changes). Replace `REINFORCE` by `PPO`, without the arguments `baseline` and `n_episodes`, and
-# the code below runs unchanged.
+# the gradient is clipped to the norm 0.5 (page 9), Adam takes the step, the sum is divided by the number of steps
+# instead of $N$, and rewards are discounted with 0.99 (page 5 shows what the last two change). Replace `REINFORCE` by
+# `PPO`, without the arguments `baseline` and `n_episodes`, and the code below runs unchanged.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)

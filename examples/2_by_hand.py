@@ -113,7 +113,7 @@ assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.m
 # %% [markdown]
 # ## When all returns are positive
 #
-# Three actions with returns 8, 10 and 12. Without a baseline every drawn action is made more likely, only by different
+# Three actions with returns 8, 10 and 12. Without a baseline each episode pushes its action up, only by different
 # amounts. With the mean of the batch the average action is left alone. The mean contains the return that it is
 # subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does not.
 
@@ -126,8 +126,9 @@ assert (rollout.returns - mean(rollout)).flatten().tolist() == [-2, 0, 2]
 assert (rollout.returns - leave_one_out(rollout)).flatten().tolist() == [-3, 0, 3]
 
 # %% [markdown]
-# Without a baseline and with the constant baseline 10, the gradient has the same mean. But if every drawn action gains,
-# most of the gradient is sampling noise. Over the three equally likely episodes the variance can be computed exactly:
+# Without a baseline and with the constant baseline 10, the gradient has the same mean. But if every episode pushes its
+# action up, most of the gradient is sampling noise. Over the three equally likely episodes the variance can be computed
+# exactly:
 
 # %%
 scores = np.eye(3) - 1 / 3

@@ -50,8 +50,8 @@ th.testing.assert_close(central_difference(bowl, theta, deltas), -2 * theta)
 # $$\sqrt{\left(\tfrac{\delta}{2} U''\right)^2 + 2 \sigma^2 / \delta^2}:$$
 #
 # a long step sees the curvature, a short one divides the noise by a small number. The best step is in between, at
-# $\delta^4 = 8 \sigma^2 / U''^2$. The central difference has no error from the curvature of a quadratic utility, so
-# here its best step is the longest; a third derivative would end that.
+# $\delta^4 = 8 \sigma^2 / U''^2$. The central difference errs by $\sigma / (\sqrt 2 \, \delta)$: a quadratic
+# utility adds no error from its curvature, so here the longest step is best. A third derivative would change that.
 
 # %%
 sigma, repetitions = 0.1, 1000
@@ -82,6 +82,7 @@ figure, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
 ax.loglog(steps, forward, "o", color="#0072B2", label="forward")
 ax.loglog(steps, theory, color="#0072B2", label="forward, by formula")
 ax.loglog(steps, central, "s", color="#D55E00", label="central")
+ax.loglog(steps, sigma / steps / 2**0.5, color="#D55E00", label="central, by formula")
 ax.axvline(best, color="grey", linestyle=":", label="best forward step, by formula")
 ax.set(title="Slope of x² at 2, noise 0.1 in each evaluation", xlabel="step δ")
 ax.set_ylabel(f"error of the slope (RMS of {repetitions})")

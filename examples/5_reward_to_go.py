@@ -50,7 +50,7 @@ assert variances[0].value > 2.5 * variances[1].value
 
 # %% [markdown]
 # The signal-to-noise ratio is the squared norm of a mean divided by the variance. For the difference of the two its
-# interval contains 0: the past rewards were noise and nothing else.
+# interval contains 0: no signal is detected in the past rewards. In expectation there is none.
 
 # %%
 difference = gradient_statistics(total - to_go)
@@ -111,13 +111,14 @@ plt.show()
 # is better. A sum of gradients divided by the number of *steps* is a ratio of two random numbers, and gives long
 # episodes too little weight; with one episode per update it even points to the short way. Divided by the number of
 # *episodes* the gradient is unbiased (`normalize_by="episodes"`). The bias falls as the number of episodes in an update
-# grows. The default is the biased choice, `normalize_by="steps"`, whose steps have the scale of A2C's.
+# grows. The default is the biased choice, `normalize_by="steps"`, whose steps have the scale of A2C's. Here the
+# sums divided by steps are multiplied by the mean length, to compare them.
 
 # %%
 # The score of the logit of "short" is 1/2 for the short way and -1/2 for the long one
 gradient, length = np.array([2 * 0.5, 3 * -0.5]), np.array([1.0, 11.0])
 print(f"exact, towards the short way:     {gradient.mean():+.3f}")
-print(f"by steps, 1 episode an update:    {(gradient / length).mean() * length.mean():+.3f} (times the mean length)")
+print(f"by steps, 1 episode an update:    {(gradient / length).mean() * length.mean():+.3f}")
 drawn = np.random.default_rng(seed).integers(2, size=(100_000, 16))
 by_steps = (gradient[drawn].sum(1) / length[drawn].sum(1)).mean() * length.mean()
 print(f"by steps, 16 episodes an update:  {by_steps:+.3f}")

@@ -94,7 +94,8 @@ plt.show()
 # is best depends on the task. Here the constant leaves less noise than "leave_one_out". Hollow markers are biased, or
 # may be: "time_mean" contains the return that it is subtracted from, and so shrinks the gradient of $N$ episodes of one
 # length to $(N - 1) / N$, noise included. "leave_one_out" is the same without that bias. The floor takes the best
-# constant for each single component of the gradient.
+# constant for each single component of the gradient: no constant goes below it, but a baseline that depends on the
+# step or the state can.
 
 # %%
 ratio = {row.baseline: row.ratio.value for row in table}

@@ -71,14 +71,14 @@ figure.suptitle("CartPole-v1, one policy, gradients of 300 episodes for each cri
 plt.show()
 
 # %% [markdown]
-# An untrained critic knows nothing of the future, so $\lambda = 0$ loses most of the gradient. With a trained one it
-# keeps most of it, with less noise than $\lambda = 1$. The usual $\lambda = 0.95$ then has less noise too, and a bias
-# of less than 5 % of the gradient. At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy
-# follows its errors.
+# An untrained critic knows nothing of the future: at $\lambda = 0$ every weight is almost the same, and neither signal
+# nor noise is left. A trained one keeps most of the gradient, with less noise than at $\lambda = 1$. The usual
+# $\lambda = 0.95$ then has less noise too, and a small bias (with six seeds and 2000 episodes 4 to 14 % of the
+# gradient). At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
 assert noise_before[0] < noise_before[3] < noise_before[-1]
 assert noise_after[0] < noise_after[3] < noise_after[-1] and noise_after[0] < 0.85 * noise_after[-1]
 assert bias_before[0] > bias_before[3] > bias_before[-1] == 0
-assert bias_before[0] > 0.8 and bias_after[0] < 0.4 and bias_after[3] < 0.05
+assert bias_before[0] > 0.9 and bias_after[0] < 0.4 and bias_after[3] < 0.2

@@ -44,8 +44,10 @@ assert check.passed
 # %% [markdown]
 # ## Signal from a step
 #
-# One estimate is one episode for the likelihood ratio. For the others it is one episode for each perturbed policy. The
-# cosine is between the *expected* estimate and the gradient; the signal-to-noise ratio is divided by the steps.
+# One estimate is one episode for the likelihood ratio, whose baseline comes from the other episodes. For the others it
+# is one episode for each perturbed policy. The perturbations are large (1.0), since the noise of single episodes drowns
+# smaller differences; curvature then turns the forward difference away from the gradient. The cosine is between the
+# *expected* estimate and the gradient; the signal-to-noise ratio is divided by the steps.
 
 # %%
 table = compare_estimators(model, n_episodes=200, n_estimates=20, seed=seed)
@@ -60,8 +62,8 @@ assert by_name["likelihood_ratio"] == max(by_name.values())
 # ## A picture
 #
 # $U(\theta)$ on a plane through $\theta$: along the gradient of 1000 episodes, and along a random direction. A single
-# estimate is one draw, so twelve of each are drawn. The width of a fan is the noise. The fans have 10, 20 and 200
-# episodes for an estimate.
+# estimate is one draw, so twelve of each are drawn. The width of a fan is the noise within the plane; the printed
+# cosines count all ten parameters. The fans have 10, 20 and 200 episodes for an estimate.
 
 
 # %%

@@ -69,7 +69,8 @@ assert 0.94 < batch[-1] < 0.985 and baseline[-1] > 0.9992
 # ## How noisy is the gradient of a real run?
 #
 # `GradientQualityCallback` logs `gradient/noise_scale`, the number of episodes whose mean gradient has a
-# signal-to-noise ratio of 1. It grows as the policy improves: the gradient shrinks faster than its noise.
+# signal-to-noise ratio of 1 (inf where no signal is detected). It grows as the policy improves: longer episodes add
+# more noise to their gradient than signal.
 
 
 # %%
@@ -94,7 +95,7 @@ model = REINFORCE(
 callback = Print()
 model.learn(15_000, callback=callback, log_interval=None)
 scales = np.array(callback.scales)
-assert np.isfinite(scales).all() and np.median(scales[-3:]) > 1.5 * np.median(scales[:3])
+assert np.median(scales[-3:]) > 1.5 * np.median(scales[:3])
 
 # %% [markdown]
 # ## Two guards
