@@ -16,6 +16,7 @@ class Tree(gym.Env[np.ndarray, np.int64]):
     """Node 0, then node 1 or 2 by the first action; if ``ragged``, a first action 1 ends the episode."""
 
     rewards = np.array([[3.0, -1.0], [5.0, -2.0], [1.0, 4.0]])
+    masks = np.ones((3, 2), dtype=bool)
 
     def __init__(self, ragged: bool = False):
         self.observation_space = spaces.Box(0, 1, (3,))
@@ -45,7 +46,8 @@ class Tree(gym.Env[np.ndarray, np.int64]):
             if self.ragged and first == 1:
                 found.append(begin)
             else:
-                found += [[*begin, (1 + first, second, self.rewards[1 + first, second])] for second in (0, 1)]
+                seconds = np.flatnonzero(self.masks[1 + first]).tolist()
+                found += [[*begin, (1 + first, second, self.rewards[1 + first, second])] for second in seconds]
         return found
 
 
@@ -181,11 +183,18 @@ class Faulty(Corridor):
             time.sleep(0.2)
 
 
-class Reused(VecEnvWrapper):
-    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
+class Wrapper(VecEnvWrapper):
+    """Changes nothing."""
 
     def reset(self):
         return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+class Reused(Wrapper):
+    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
 
     def step_wait(self):
         obs, rewards, dones, infos = self.venv.step_wait()

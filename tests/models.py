@@ -53,6 +53,19 @@ class OwnPrediction(ActorCriticPolicy):
         return super()._predict(observation, deterministic)
 
 
+class FromDistribution(ActorCriticPolicy):
+    """Takes everything from ``get_distribution`` and ``predict_values``."""
+
+    def forward(self, obs, deterministic=False):  # type: ignore[no-untyped-def]
+        distribution = self.get_distribution(obs)
+        actions = distribution.get_actions(deterministic=deterministic)
+        return actions, self.predict_values(obs), distribution.log_prob(actions)
+
+    def evaluate_actions(self, obs, actions):  # type: ignore[no-untyped-def]
+        distribution = self.get_distribution(obs)
+        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
+
+
 class Double(FlattenExtractor):
     """Stable-Baselines3 hands observations on in float32; from here on all is float64."""
 

@@ -42,8 +42,6 @@ MAX_LINES = 250
 LONGER = {"reinforce.py", "finite_difference.py"}
 PACKAGES = ("", ".diagnostics", ".diagnostics.plots", ".estimation", ".recurrent", ".zoo")
 PUBLIC = tuple(f"sb3_reinforce{package}" for package in PACKAGES)
-# What a public module needs beside the dependencies
-NEEDS = {"sb3_reinforce.diagnostics.plots": "matplotlib", "sb3_reinforce.zoo": "rl_zoo3"}
 PRIVATE = re.compile(r"_[a-z]\w*")
 
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
@@ -145,7 +143,7 @@ def test_private_names_of_others_are_those_with_a_documented_reason() -> None:
     found = {name: places for name, places in foreign_names().items() if name not in allowed}
     unexplained = [f"{name}: {', '.join(places)}" for name, places in found.items() if name not in FOREIGN]
     assert not unexplained, "\n".join(unexplained)
-    assert found.keys() == FOREIGN.keys() and len(FOREIGN) <= 6
+    assert found.keys() == FOREIGN.keys()
 
 
 def test_nothing_private_of_others_is_replaced() -> None:
@@ -194,8 +192,6 @@ def parameters_of(thing: object) -> list[str]:
 
 @pytest.mark.parametrize("module_name", PUBLIC)
 def test_public_names_are_there_and_documented(module_name: str) -> None:
-    if module_name in NEEDS:
-        pytest.importorskip(NEEDS[module_name])
     module = importlib.import_module(module_name)
     assert module.__all__
     undocumented = []

@@ -3,10 +3,10 @@ What a comparison shows: tables, learning curves, and a summary by rliable (inte
 
     python examples/benchmarks/compare_plots.py results.csv --output results
 
-Writes results_curves.png (the interquartile mean of the seeds against steps, and against CPU seconds, of the
-seeds that all algorithms were run on) and results_summary.png (interquartile mean, performance profiles and probability
-of improvement over all tasks), and prints the final evaluations as a Markdown table. In the summary 0 is a random
-policy and 1 the Zoo's published PPO, or another reference; it has the algorithms that were run on every task.
+Writes results_curves.png (the interquartile mean of the seeds against steps, and against CPU seconds, of the seeds that
+all algorithms were run on) and results_summary.png (interquartile mean, performance profiles and probability of
+improvement over all tasks), and prints the final evaluations. In the summary 0 is a random policy and 1 the Zoo's
+published PPO, or another reference; it has the algorithms that were run on every task.
 """
 
 import argparse
@@ -157,22 +157,6 @@ def draw_intervals(axis: Axes, values: dict[str, np.ndarray], intervals: dict[st
     axis.invert_yaxis()
 
 
-def table(results: pd.DataFrame) -> str:
-    """The final evaluations: median over the seeds, least and greatest, and the median of the seconds."""
-    lines = [
-        "| task (steps) | algorithm | seeds | return: median (least, greatest) | CPU seconds |",
-        "|---|---|---|---|---|",
-    ]
-    final = results[results["evaluation"] == "final"]
-    for (task, budget, algorithm), runs in final.groupby(["task", "budget", "algorithm"], sort=False):
-        returns = runs["return"]
-        lines.append(
-            f"| {task} ({budget:,}) | {LABELS.get(algorithm, algorithm)} | {len(runs)} | "
-            f"{returns.median():.1f} ({returns.min():.1f}, {returns.max():.1f}) | {runs['cpu_seconds'].median():.0f} |"
-        )
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="CSVs that compare.py has written")
@@ -186,7 +170,8 @@ def main() -> None:
         key=lambda column: column.map(order.index) if column.name == "algorithm" else column,
         kind="stable",
     )
-    print(table(results))
+    final = results[results["evaluation"] == "final"].groupby(["task", "budget", "algorithm"], sort=False)
+    print(final[["return", "cpu_seconds"]].agg(["count", "median", "min", "max"]).to_string())
     draw_curves(results)
     plt.savefig(arguments.output.with_name(f"{arguments.output.name}_curves.png"), dpi=120)
     scores = final_scores(results)

@@ -13,7 +13,6 @@ evaluations.
 
 import argparse
 import csv
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -109,20 +108,14 @@ def main() -> None:
     parser.add_argument("--output", default="masks.csv")
     arguments = parser.parse_args()
     th.set_num_threads(1)
-    ratios = []
     with open(arguments.output, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         for seed in arguments.seeds:
-            cpu_seconds = {}
             for name in ("REINFORCE", "MaskablePPO"):
                 for row in rows(name, seed, arguments.evaluate_at):
                     print(*row.values(), flush=True)
                     writer.writerow(row)
-                    cpu_seconds[name] = row["cpu_seconds"]
-            ratios.append(cpu_seconds["MaskablePPO"] / cpu_seconds["REINFORCE"])
-    rounds = ", ".join(f"{ratio:.1f}" for ratio in ratios)
-    print(f"steps per second of the CPU: {statistics.median(ratios):.1f} times MaskablePPO (seeds: {rounds})")
 
 
 if __name__ == "__main__":

@@ -207,23 +207,6 @@ class Model:
         return rows
 
 
-def tables(rows: pd.DataFrame) -> str:
-    """Medians of the steps a second, and of the seconds to the return, as tables in Markdown."""
-    text = ""
-    for column in ("rate", "seconds"):
-        medians = rows.pivot_table(column, "milliseconds", ["kind", "number"], aggfunc="median")
-        lines = [
-            ["ms a step", *(f"{kind}, {number}" for kind, number in medians)],
-            ["---"] * (len(medians.columns) + 1),
-        ]
-        lines += [
-            [f"{ms:g}", *(f"{value:,.0f}" if value > 100 else f"{value:.3g}" for value in values)]
-            for ms, values in medians.iterrows()
-        ]
-        text += f"\n{column}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return text
-
-
 def draw(rows: pd.DataFrame, n_rounds: int, path: Path) -> None:
     import matplotlib
 
@@ -272,7 +255,7 @@ def main() -> None:
     unknown = rows.seconds.isna() & rows.wait_fraction.notna()
     rows.loc[unknown, "seconds"] = (rows.steps.median() / rows.rate[unknown]).round(2)
     rows.to_csv(arguments.output.with_suffix(".csv"), index=False)
-    print(tables(rows))
+    print(rows.pivot_table(["rate", "seconds"], ["kind", "number"], "milliseconds", "median").to_string())
     draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))
 
 

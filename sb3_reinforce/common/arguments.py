@@ -102,18 +102,16 @@ def check_device(name: str, value: Any) -> Any:
 
 class CheckedSchedule(FloatSchedule):
     """
-    A number, or a function of the remaining progress (from 1 to 0), whose every value is checked.
+    A number ≥ 0, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    With ``above``, ``low`` is excluded until the end of training, or with ``may_reach`` only at its start.
+    With ``above``, 0 is excluded until the end of training, or with ``may_reach`` only at its start.
     """
 
-    def __init__(
-        self, name: str, schedule: Any, low: float, high: float = MAX, above: bool = False, may_reach: bool = False
-    ):
+    def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach: bool = False):
         check_kind(name, schedule, (Real, Callable), "a number or a schedule")
-        super().__init__(schedule if callable(schedule) else check_number(name, schedule, low, high, above))
+        super().__init__(schedule if callable(schedule) else check_number(name, schedule, 0, high, above))
         self.given = schedule
-        self.check = partial(check_number, low=low, high=high)
+        self.check = partial(check_number, low=0, high=high)
         self.name = name
         self.above = above
         self.may_reach = may_reach

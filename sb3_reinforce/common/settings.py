@@ -87,7 +87,7 @@ def check_verbose(name: str, value: Any) -> int:
 check_count = partial(check_integer, low=1)
 COMMON_ARGUMENTS: dict[str, Check] = {
     "policy": partial(check_kind, kinds=(str, type), allowed="a name or a class"),
-    "learning_rate": partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE),
+    "learning_rate": partial(CheckedSchedule, high=MAX_LEARNING_RATE),
     # SB3 users also write inf for no clipping
     "max_grad_norm": optional(partial(check_number, low=0, high=math.inf, above=True)),
     "max_episode_steps": check_count,
@@ -102,7 +102,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "n_steps": optional(check_count),
     "gamma": partial(check_number, low=0, high=1),
     "gae_lambda": partial(check_number, low=0, high=1),
-    "ent_coef": partial(CheckedSchedule, low=0),
+    "ent_coef": CheckedSchedule,
     "vf_coef": partial(check_number, low=0),
     "baseline": check_name,
     "n_episodes": optional(check_count),
@@ -112,8 +112,8 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "normalize_by": partial(check_choice, choices=("steps", "episodes")),
     "n_critic_updates": check_count,
     "batch_size": check_count,
-    "critic_learning_rate": optional(partial(CheckedSchedule, low=0, high=MAX_LEARNING_RATE)),
-    "temperature": partial(CheckedSchedule, low=0, above=True, may_reach=True, high=MAX_TEMPERATURE),
+    "critic_learning_rate": optional(partial(CheckedSchedule, high=MAX_LEARNING_RATE)),
+    "temperature": partial(CheckedSchedule, above=True, may_reach=True, high=MAX_TEMPERATURE),
     "min_std": partial(check_number, low=0, high=MAX_STD),
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),
@@ -121,13 +121,13 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
     "normalize_advantage": check_flag,
     "step": partial(check_choice, choices=("optimizer", "natural")),
-    "target_kl": optional(partial(CheckedSchedule, low=0)),
+    "target_kl": optional(CheckedSchedule),
 }
 FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "estimator": check_name,
     "perturbation": check_name,
     "n_delta": optional(check_count),
-    "delta_std": optional(partial(CheckedSchedule, low=0, above=True, high=MAX_STD)),
+    "delta_std": optional(partial(CheckedSchedule, above=True, high=MAX_STD)),
     "n_eval_episodes": check_count,
     "common_random_numbers": check_flag,
     "n_top": optional(check_count),

@@ -104,12 +104,11 @@ def sums_by_backward_passes(
     obs, actions = used_inputs(rollout)
     for number, steps in enumerate(steps_of(episode)):
         log_prob = log_prob_of(rollout.policy, take(obs, steps), actions[steps])
-        yield number, th.stack([vector_jacobian_product(log_prob, parameters, part) for part in w[:, steps]])
-
-
-def vector_jacobian_product(log_prob: th.Tensor, parameters: Parameters, w: th.Tensor) -> th.Tensor:
-    """``wᵀ ∂ log π / ∂θ``, shape ``(n,)``; the graph is kept."""
-    return to_vector(th.autograd.grad(log_prob, parameters, w.to(log_prob), retain_graph=True, materialize_grads=True))
+        gradients = (
+            th.autograd.grad(log_prob, parameters, part.to(log_prob), retain_graph=True, materialize_grads=True)
+            for part in w[:, steps]
+        )
+        yield number, th.stack([*map(to_vector, gradients)])
 
 
 def steps_of(episode: th.Tensor) -> Iterator[th.Tensor]:

@@ -175,7 +175,6 @@ def test_at_the_end_of_a_rollout_a_callback_finds_the_dones_of_its_last_step():
 
 @all_kinds
 def test_callbacks_of_sb3(kind, tmp_path):
-    pytest.importorskip("rich")
     env, eval_env = (VecNormalize(make_vec_env("CartPole-v1", n_envs)) for n_envs in (2, 1))
     stop, every = StopTrainingOnRewardThreshold(reward_threshold=1e9), Record(lambda model: None, at="step")
     callbacks = [
@@ -223,7 +222,6 @@ def test_the_log_of_a_search(tmp_path):
 
 
 def test_tensorboard(tmp_path):
-    pytest.importorskip("tensorboard")
     make("steps", tensorboard_log=tmp_path).learn(32, log_interval=100)
     assert list((tmp_path / "REINFORCE_1").glob("events*"))
 

@@ -4,14 +4,14 @@ import pytest
 import torch as th
 from callbacks import At
 from environments import Corridor
-from models import all_kinds, make
+from models import FromDistribution, all_kinds, make
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import compare_baselines
 
 
-class WithoutParts(ActorCriticPolicy):
+class WithoutParts(FromDistribution):
     """Has neither an ``mlp_extractor`` nor an ``action_net``."""
 
     def _build(self, lr_schedule):
@@ -24,15 +24,6 @@ class WithoutParts(ActorCriticPolicy):
 
     def predict_values(self, obs):
         return self.critic(self.extract_features(obs))
-
-    def forward(self, obs, deterministic=False):
-        distribution = self.get_distribution(obs)
-        actions = distribution.get_actions(deterministic=deterministic)
-        return actions, self.predict_values(obs), distribution.log_prob(actions)
-
-    def evaluate_actions(self, obs, actions):
-        distribution = self.get_distribution(obs)
-        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
 
 
 @all_kinds

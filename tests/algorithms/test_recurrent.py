@@ -202,12 +202,6 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
         first += len(rollout.dones)
 
 
-def test_the_default_rollouts():
-    models = [REINFORCE("MlpPolicy", "CartPole-v1", baseline=name, device="cpu") for name in ("value", "mean")]
-    models.append(RecurrentREINFORCE("MlpLstmPolicy", "CartPole-v1", device="cpu"))
-    assert [(model.n_steps, model.n_episodes) for model in models] == [(32, None), (None, 16), (None, 16)]
-
-
 def test_the_critics_minibatches_are_whole_sequences():
     model = make_recurrent(n_steps=40, batch_size=10, double=False)
     values = model.policy.sequence_values

@@ -12,6 +12,7 @@ from callbacks import At, Record
 from environments import Scales
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import TransformObservation
 from models import plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -96,16 +97,12 @@ def test_the_same_seed_gives_the_same_run_and_a_saved_model_goes_on(task, tmp_pa
 
 
 def test_dicts_are_compared_key_by_key():
-    class Dicts(gym.ObservationWrapper):
-        def __init__(self, env):
-            super().__init__(env)
-            self.observation_space = spaces.Dict({"a": env.observation_space, "b": env.observation_space})
-
-        def observation(self, obs):
-            return {"a": 0 * obs, "b": obs}
+    box = Scales().observation_space
+    space = spaces.Dict({"a": box, "b": box})
+    in_dicts = partial(TransformObservation, func=lambda obs: {"a": 0 * obs, "b": obs}, observation_space=space)
 
     def model_of(**kwargs):
-        env = DummyVecEnv([lambda: Dicts(Scales(**kwargs))] * 4)
+        env = DummyVecEnv([lambda: in_dicts(Scales(**kwargs))] * 4)
         return REINFORCE("MultiInputPolicy", env, baseline="leave_one_out", episodes_per_start=2)
 
     assert model_of().learn(8).num_timesteps == 8

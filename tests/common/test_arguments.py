@@ -31,7 +31,7 @@ TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_AR
 NO_NUMBERS = ["x", True, [1], 1j, None]
 WRONG = {
     "check_number": [*NO_NUMBERS, NAN, INF, -INF],
-    "CheckedSchedule": [*NO_NUMBERS, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
+    "CheckedSchedule": [*NO_NUMBERS, -1, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
     "check_integer": [*NO_NUMBERS, NAN, INF, 2.5, 2**63],
     "check_verbose": ["x", [1], None, 2.5, -1],
     "check_flag": ["no", 1, None],
@@ -54,7 +54,7 @@ def wrong_values(check):
     if keywords.get("high", INF) < INF:
         values.append(keywords["high"] * 1.1)
     if keywords.get("above"):
-        values.append(keywords["low"])
+        values.append(keywords.get("low", 0))
     if keywords.get("high") == INF:
         values.remove(INF)
     return values
@@ -220,10 +220,10 @@ def test_the_search_recommends_the_cpu(policy):
         (partial(arguments.check_number, low=0), -1, "finite and >= 0"),
         (partial(arguments.check_number, low=0, above=True), 0, "finite and > 0"),
         (partial(arguments.check_number, low=0, high=1), 2, r"in \[0, 1\]"),
-        (partial(arguments.CheckedSchedule, low=0, high=1, above=True), 0.0, r"in \(0, 1\]"),
+        (partial(arguments.CheckedSchedule, high=1, above=True), 0.0, r"in \(0, 1\]"),
         (partial(arguments.check_integer, low=2), 1, "at least 2"),
         (partial(arguments.check_integer, low=2, high=5), 6, "at least 2 and at most 5"),
-        (partial(arguments.CheckedSchedule, low=0), "1e-3", "a number or a schedule"),
+        (arguments.CheckedSchedule, "1e-3", "a number or a schedule"),
         (partial(arguments.check_choice, choices=("a", "b")), "c", "one of 'a', 'b'"),
         (partial(arguments.check_kind, kinds=(int, str)), None, "int or str"),
     ],

@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+import pandas
 import pytest
 import torch as th
 from environments import Corridor, Tree
@@ -179,7 +180,7 @@ def test_a_users_function_is_a_row_and_the_table_prints():
 
 def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
-    frame = pytest.importorskip("pandas").DataFrame(table.to_records()).set_index("baseline")
+    frame = pandas.DataFrame(table.to_records()).set_index("baseline")
     assert frame.equals(table.to_pandas())
     assert frame.loc["none", "ratio"] == 1
     monkeypatch.setitem(sys.modules, "pandas", None)

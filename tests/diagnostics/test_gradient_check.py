@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from environments import Corridor, Tree
 from gymnasium import spaces
+from models import FromDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -17,6 +18,7 @@ from stable_baselines3.common.torch_layers import NatureCNN
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
 from sb3_reinforce.estimation import weights
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 ACTION_SPACES = [
     spaces.Discrete(3),
@@ -188,9 +190,6 @@ class HalfDetached(ActorCriticPolicy):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_memory_that_larger_weights_would_make_explode_passes(seed):
-    pytest.importorskip("sb3_contrib")
-    from sb3_reinforce.recurrent import RecurrentREINFORCE
-
     memory = {"memory": "rnn", "lstm_hidden_size": 64, "lstm_kwargs": {"nonlinearity": "relu"}}
     model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=seed)
     assert check_gradient(model).passed
@@ -224,7 +223,7 @@ class WithoutBias(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
 
 
-class OwnHead(ActorCriticPolicy):
+class OwnHead(FromDistribution):
     """Its distribution comes from another layer."""
 
     def _build(self, lr_schedule):
@@ -236,15 +235,6 @@ class OwnHead(ActorCriticPolicy):
         return self.action_dist.proba_distribution(
             self.head(self.mlp_extractor.forward_actor(self.extract_features(obs)))
         )
-
-    def forward(self, obs, deterministic=False):
-        distribution = self.get_distribution(obs)
-        actions = distribution.get_actions(deterministic)
-        return actions, self.predict_values(obs), distribution.log_prob(actions)
-
-    def evaluate_actions(self, obs, actions):
-        distribution = self.get_distribution(obs)
-        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
 
 
 @pytest.mark.parametrize(("policy", "failures"), [(Stale, ["sign"]), (WithoutBias, []), (OwnHead, [])])

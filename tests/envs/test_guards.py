@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At
-from environments import Corridor, Faulty, Random
+from environments import Corridor, Faulty, Random, Wrapper
 from gymnasium import spaces
 from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
@@ -52,16 +52,6 @@ class Recording(VecNormalize):
         result = super().step_wait()
         self.seen.append(statistics(self))
         return result
-
-
-class Wrapper(VecEnvWrapper):
-    """Changes nothing."""
-
-    def reset(self):
-        return self.venv.reset()
-
-    def step_wait(self):
-        return self.venv.step_wait()
 
 
 WIDE = spaces.Box(-INF, INF, (7,), np.float64)

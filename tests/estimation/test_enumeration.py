@@ -110,13 +110,11 @@ def test_without_discounted_scores_the_gradient_is_another():
 
 
 def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
-    """E[ĝ] = (E[Σ] − Cov(ĝ, steps)) / E[steps], where Σ is the sum before the division; not parallel to ∇E[G_0]."""
+    """The sum before the division is not; the ratio is not even parallel to ∇E[G_0]."""
     model = make_model(ragged=True, baseline="none", normalize_by="steps")
     expect = partial(expectation, model, model.env.envs[0].unwrapped.trajectories(), 2)
-    gradient, steps, sums = expect(lambda g, n: g), expect(lambda g, n: n), expect(lambda g, n: g * n)
-    covariance = sums - gradient * steps
+    gradient, sums = expect(lambda g, n: g), expect(lambda g, n: g * n)
     assert_equal(sums, 2 * gradient_of_return(model))
-    assert_equal(gradient, (sums - covariance) / steps)
     assert th.cosine_similarity(gradient.flatten(), gradient_of_return(model).flatten(), dim=0) < 1 - 1e-4
 
 

@@ -30,6 +30,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from sb3_reinforce import REINFORCE, ActionMaskObservation, FiniteDifference, GymnasiumVecEnv, MaskedPolicy
 from sb3_reinforce.diagnostics import PitfallCallback, check_gradient, compare_baselines, compare_estimators
 from sb3_reinforce.estimation import BASELINES, gradients_by_episode
+from sb3_reinforce.policies.masks import sizes_of
 from sb3_reinforce.recurrent import MaskedLstmPolicy, RecurrentREINFORCE
 
 ALGORITHMS = {
@@ -48,10 +49,6 @@ TASKS = {
     "image": (spaces.Dict({"image": IMAGE, "vector": VECTOR}), spaces.Discrete(5)),
     "numbers": (spaces.MultiDiscrete([2, 3]), spaces.Discrete(5)),
 }
-
-
-def sizes_of(space):
-    return [int(space.n)] if isinstance(space, spaces.Discrete) else space.nvec.tolist()
 
 
 class Masked(Random):
@@ -190,17 +187,6 @@ class MaskedTree(Tree):
 
     def action_masks(self):
         return self.masks[self.node]
-
-    def trajectories(self):
-        found = []
-        for first in (0, 1):
-            begin = [(0, first, self.rewards[0, first])]
-            if self.ragged and first == 1:
-                found.append(begin)
-            else:
-                seconds = np.flatnonzero(self.masks[1 + first])
-                found += [[*begin, (1 + first, int(a), self.rewards[1 + first, a])] for a in seconds]
-        return found
 
 
 @pytest.mark.parametrize("ragged", [True, False])

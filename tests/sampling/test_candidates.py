@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environments import Wrapper
 from gymnasium import spaces
 from models import OwnPrediction, Scaled
 from policy_changes import CHANGES
@@ -18,7 +19,6 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
-    VecEnvWrapper,
     VecFrameStack,
     VecMonitor,
     VecNormalize,
@@ -233,14 +233,11 @@ def test_an_episode_that_does_not_end_is_named(seeded):
     evaluate(env, [2, 3, 9], seeds, max_episode_steps=9)
 
 
-class Shifted(VecEnvWrapper):
+class Shifted(Wrapper):
     """Changes rewards."""
 
-    def reset(self):
-        return self.venv.reset()
-
     def step_wait(self):
-        obs, rewards, dones, infos = self.venv.step_wait()
+        obs, rewards, dones, infos = super().step_wait()
         return obs, rewards - 2.0, dones, infos
 
 
@@ -248,14 +245,11 @@ class Monitored(VecMonitor):
     """A subclass with the steps of a wrapper that leaves rewards alone."""
 
 
-class NumericEnds(VecEnvWrapper):
+class NumericEnds(Wrapper):
     """Says in numbers which episodes end, as some VecEnvs do."""
 
-    def reset(self):
-        return self.venv.reset()
-
     def step_wait(self):
-        obs, rewards, dones, infos = self.venv.step_wait()
+        obs, rewards, dones, infos = super().step_wait()
         return obs, rewards, dones.astype(np.float32), infos
 
 

@@ -250,16 +250,9 @@ class Integers(gym.Env):
 @pytest.mark.parametrize("dictionary", [False, True])
 def test_training_sees_the_fractions_that_the_policy_saw_and_drew(dictionary):
     """VecNormalize returns floats for a Box of integers, and the Gaussian policy draws them."""
-
-    class Wrapped(gym.ObservationWrapper):
-        def __init__(self, env):
-            super().__init__(env)
-            self.observation_space = gym.spaces.Dict({"a": env.observation_space})
-
-        def observation(self, obs):
-            return {"a": obs}
-
-    env = make_vec_env(lambda: Wrapped(Integers()) if dictionary else Integers(), 2, seed=0)
+    space = gym.spaces.Dict({"a": Integers.observation_space})
+    in_dicts = partial(gym.wrappers.TransformObservation, func=lambda obs: {"a": obs}, observation_space=space)
+    env = make_vec_env(lambda: in_dicts(Integers()) if dictionary else Integers(), 2, seed=0)
     policy = "MultiInputPolicy" if dictionary else "MlpPolicy"
     model = REINFORCE(policy, VecNormalize(env), learning_rate=0.0, n_steps=8, seed=0, device="cpu")
     model.learn(16, lambda *_: True)
