@@ -30,9 +30,9 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     :return: ĝ, shape ``(n,)``
     :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
-    check_deltas(theta, deltas)
+    deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = utility(th.cat([theta[None], theta + deltas]))
+    utilities = utility(th.cat([theta[None], theta + deltas])).to(theta)
     return solve(deltas, utilities[1:] - utilities[0])
 
 
@@ -48,9 +48,9 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :return: ĝ, shape ``(n,)``
     :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
-    check_deltas(theta, deltas)
+    deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = utility(th.stack([theta + deltas, theta - deltas]))
+    utilities = utility(th.stack([theta + deltas, theta - deltas])).to(theta)
     top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
     plus, minus = utilities[:, top]
     return solve(2 * deltas[top], plus - minus)
@@ -69,20 +69,23 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     :return: ĝ, shape ``(n,)``
     :raises ValueError: If Δ does not fit θ, or all perturbations are equal
     """
-    check_deltas(theta, deltas)
+    deltas = check_deltas(theta, deltas)
     design = deltas - deltas.mean(0)
     check_design(design, deltas)
-    utilities = utility(theta + deltas)
+    utilities = utility(theta + deltas).to(theta)
     return solve(design, utilities - utilities.mean())
 
 
-def check_deltas(theta: th.Tensor, deltas: th.Tensor) -> None:
-    """Check that perturbations are rows like θ, and finite."""
-    if deltas.ndim != 2 or len(deltas) == 0 or deltas.shape[1:] != theta.shape or not deltas.isfinite().all():
+def check_deltas(theta: th.Tensor, deltas: Any) -> th.Tensor:
+    """Return finite perturbations, rows like θ, in its precision."""
+    if not isinstance(deltas, th.Tensor):
+        raise TypeError(f"deltas must be a tensor, got {deltas!r} of type {type(deltas).__name__}")
+    if len(deltas.shape) != 2 or len(deltas) == 0 or deltas.shape[1:] != theta.shape or not deltas.isfinite().all():
         raise ValueError(
-            f"deltas must be finite numbers of shape (k, n), with k > 0 and n = {len(theta)} parameters of theta, got "
-            f"shape {tuple(deltas.shape)}: {deltas}"
+            f"deltas must be finite numbers of shape (k, n), with k > 0 and (n,) = {tuple(theta.shape)} the shape of "
+            f"theta, got shape {tuple(deltas.shape)}: {deltas}"
         )
+    return deltas.to(theta)
 
 
 def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
@@ -97,7 +100,7 @@ def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
 def solve(design: th.Tensor, differences: th.Tensor) -> th.Tensor:
     """``ĝ = argmin ‖design · ĝ − differences‖²`` of least norm, for a design ``(k, n)`` and differences ``(k,)``."""
     # By the singular value decomposition: the normal equations would square the condition of the design
-    gradient: th.Tensor = th.linalg.lstsq(design.to(differences), differences[:, None], driver="gelsd").solution[:, 0]
+    gradient: th.Tensor = th.linalg.lstsq(design, differences[:, None], driver="gelsd").solution[:, 0]
     return gradient
 
 
@@ -194,10 +197,8 @@ def check_candidates(must: str, candidates: Any, n_parameters: int) -> th.Tensor
     shape = tuple(candidates.shape) if isinstance(candidates, th.Tensor) else ()
     is_shaped = len(shape) in (2, 3) and 0 not in shape and shape[-1] == n_parameters
     if not is_shaped or not candidates.isfinite().all():
-        raise ValueError(
-            f"{must} a finite tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), got shape {shape}: "
-            f"{candidates!r}"
-        )
+        got = f"shape {shape}: {candidates}" if isinstance(candidates, th.Tensor) else f"{candidates!r}"
+        raise ValueError(f"{must} a finite tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), got {got}")
     result: th.Tensor = candidates.detach().to("cpu", th.float64)
     return result
 

@@ -216,10 +216,8 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     for key, path, _ in classes_of(hyperparams):
         try:
             utils.get_class_by_name(path)
-        except (AttributeError, ValueError) as error:
+        except (AttributeError, TypeError, ValueError) as error:
             raise ConfigurationError(f"{key} must be the path of a class, got {path!r}: {error}") from error
-    for key in ("monitor_kwargs", "normalize"):
-        as_dict(key, hyperparams.get(key))
     for key in ("n_envs", "frame_stack"):
         check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
@@ -232,8 +230,10 @@ def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
         for each in given if isinstance(given, list) else [given]:
             path, names = next(iter(each.items())) if isinstance(each, dict) and each else (each, {})
             is_name = key == "policy" and "." not in str(path)
-            if not (is_name or path is None or isinstance(path, (type, BaseCallback))):
-                yield key, path, as_dict(key, names)
+            if names is None:
+                raise ConfigurationError(f"The arguments of {path} in {key} must be a dict, got None")
+            if not (is_name or path is None or isinstance(path, BaseCallback if key == "callback" else type)):
+                yield key, path, as_dict(f"The arguments of {path} in {key}", names)
 
 
 def as_dict(key: str, value: Any) -> Settings:

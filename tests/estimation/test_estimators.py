@@ -115,7 +115,7 @@ def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(nam
 @pytest.mark.parametrize("shape", [(4, N + 1), (0, N), (N,), None])
 def test_perturbations_that_do_not_fit_theta_are_an_error_before_anything_is_evaluated(name, shape):
     deltas = th.full((4, N), th.nan) if shape is None else th.rand(shape)
-    with pytest.raises(ValueError, match=rf"deltas must be .* n = {N} parameters"):
+    with pytest.raises(ValueError, match=rf"deltas must be .* \({N},\) the shape of theta"):
         ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N).double(), deltas.double())
 
 
@@ -127,7 +127,18 @@ def test_perturbations_may_be_of_another_precision(name):
         return x.exp().sum(-1)
 
     expected = ESTIMATORS[name](utility, theta, deltas.double())
-    th.testing.assert_close(ESTIMATORS[name](utility, theta, deltas), expected, rtol=1e-4, atol=1e-4)
+    assert th.equal(ESTIMATORS[name](utility, theta, deltas), expected)
+    coordinates = th.eye(N, dtype=th.long)
+    expected = ESTIMATORS[name](utility, theta, coordinates.double())
+    assert th.equal(ESTIMATORS[name](utility, theta, coordinates), expected)
+    single = ESTIMATORS[name](lambda x: utility(x).float(), theta, coordinates)
+    th.testing.assert_close(single, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_perturbations_that_are_no_tensor_are_named(name):
+    with pytest.raises(TypeError, match="deltas must be a tensor, got array"):
+        ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N).double(), np.eye(N))
 
 
 def test_fit_quality_is_a_textbook_regressions():

@@ -191,6 +191,8 @@ SETTINGS = [
     ("vec_env_wrapper: [3]", "vec_env_wrapper must be the path of a class, got 3"),
     ("callback: sb3_reinforce.Nope", "callback must be the path of a class, got 'sb3_reinforce.Nope'"),
     ("env_wrapper: [{gymnasium.wrappers.RescaleAction: {low: 1}}]", "unexpected keyword argument 'low'"),
+    ("env_wrapper: [{gymnasium.wrappers.FlattenObservation: }]", "in env_wrapper must be a dict, got None"),
+    ("env_wrapper: ..x", "env_wrapper must be the path of a class, got '..x'"),
     ("normalize: {norm_ob: true}", "unexpected keyword argument 'norm_ob'"),
     ("normalize: {norm_obs_keys: [x]}", "`norm_obs_keys` param is applicable only with"),
     ("use_sde: true", "use_sde=True is for Box action spaces"),
