@@ -28,6 +28,7 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
+    :raises TypeError: If Δ is no tensor
     :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
     deltas = check_deltas(theta, deltas)
@@ -46,6 +47,7 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
         section 3.3), which biases ĝ towards them; None for all
     :return: ĝ, shape ``(n,)``
+    :raises TypeError: If Δ is no tensor
     :raises ValueError: If Δ does not fit θ, or all perturbations are zero
     """
     deltas = check_deltas(theta, deltas)
@@ -67,6 +69,7 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
+    :raises TypeError: If Δ is no tensor
     :raises ValueError: If Δ does not fit θ, or all perturbations are equal
     """
     deltas = check_deltas(theta, deltas)
