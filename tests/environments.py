@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
 
 class Tree(gym.Env[np.ndarray, np.int64]):
@@ -205,3 +205,9 @@ class Reused(Wrapper):
             self.last[i] = infos[i]["terminal_observation"]
             infos[i]["terminal_observation"] = self.last[i]
         return obs, rewards, self.dones, infos
+
+
+def of_two(**fault):
+    """Two environments, of which the second has the fault."""
+    both = {"observation_space": fault.get("observation_space"), "truncate": fault.get("truncate", False)}
+    return DummyVecEnv([lambda: Faulty(**both), lambda: Faulty(**fault)])

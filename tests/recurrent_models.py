@@ -62,3 +62,9 @@ def by_steps(policy, obs, dones, state):
         values.append(value)
         starts = th.as_tensor(done).to(starts)
     return th.cat(logits), th.cat(values)
+
+
+def set_n_steps(model):
+    """From the second rollout on."""
+    if model.num_timesteps > 0:
+        model.n_steps, model.n_episodes = 4, None

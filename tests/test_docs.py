@@ -45,7 +45,7 @@ ELSEWHERE = {
     r"compare(_plots)?\.py": "tests/zoo/test_compare.py runs both scripts",
     r"-optimize|--trial-id|-f agents$|train --help$": "tests/zoo runs these commands with other settings and folders",
     r"^make agents$": "minutes; tests/zoo/test_zoo.py runs its two commands",
-    r"torch\.distributed\.run": "tests/common/test_processes.py and tests/zoo/test_zoo_processes.py start the launcher",
+    r"torch\.distributed\.run": "tests/common/test_process_ends.py and tests/zoo/test_zoo_processes.py start it",
     r"processes\.py": "minutes: it starts eight processes for each row",
     r"^make (format|tables|test-lowest)$|-m slow$": "it changes files, or takes many minutes: by hand, or at night",
     r"^hf |^tensorboard |^python train\.py$|python -m sb3_reinforce\.zoo$": "a program of others, or no command",

@@ -10,10 +10,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At, Record
+from callbacks import Record
 from environments import Corridor, Random, Reused
 from gymnasium import spaces
-from models import KINDS, all_kinds, make, moved_by_learning, plain
+from models import KINDS, all_kinds, make, moved_by_learning
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import (
@@ -27,23 +27,28 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common import settings
-from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
-from sb3_reinforce.policies.evaluation import MIN_TEMPERATURE
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
 
+
 FLAT = spaces.Box(-1, 1, (3,))
+
+
 IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+
 DICT = spaces.Dict({"image": IMAGE, "flat": FLAT, "n": spaces.Discrete(3)})
+
+
 TWO = spaces.Discrete(2)
+
+
 SPACES = [
     (spaces.Box(-1, 1, (2, 2), np.float64), TWO, "MlpPolicy"),
     (spaces.Discrete(4), TWO, "MlpPolicy"),
@@ -146,6 +151,8 @@ def test_a_policy_may_be_compiled():
 
 
 LOCALS = {"self", "new_obs", "rewards", "dones", "infos"}
+
+
 LOCALS_OF_A2C = {
     *(LOCALS | {"env", "rollout_buffer", "total_timesteps", "tb_log_name"}),
     *("actions", "clipped_actions", "values", "log_probs", "n_steps"),
@@ -240,119 +247,6 @@ def test_the_callers_policy_kwargs_are_not_written_to():
     assert policy_kwargs == {"net_arch": [8]}
 
 
-def rate_of(optimizer):
-    return optimizer.param_groups[0]["lr"]
-
-
-def test_an_overshooting_last_rollout_trains_at_no_negative_rate():
-    model = make("steps", n_steps=60, learning_rate=lambda progress: progress * 1e-3)
-    rates = Record(lambda model: rate_of(model.policy.optimizer), at="step")
-    model.learn(100, callback=rates, log_interval=None)
-    assert model.num_timesteps == 120 and rate_of(model.policy.optimizer) == 0 and min(rates.records) >= 0
-
-
-def temperature_of(model):
-    """τ, as the output of the last layer shows it."""
-    layer, x = model.policy.action_net, th.ones(1, model.policy.action_net.in_features)
-    with th.no_grad():
-        return (th.nn.functional.linear(x, layer.weight, layer.bias) / layer(x)).mean().item()
-
-
-def test_schedules_are_followed():
-    def falling(start):
-        return LinearSchedule(start, start / 2, 1.0)
-
-    model = make(
-        "steps", n_steps=16, learning_rate=falling(1e-3), critic_learning_rate=falling(4e-3), ent_coef=falling(0.1),
-        temperature=falling(2.0),
-    )  # fmt: skip
-    temperatures = Record(temperature_of, at="rollout_start")
-    model.learn(64, callback=temperatures)
-    assert temperatures.records == pytest.approx([2.0, 1.75, 1.5, 1.25])
-    assert rate_of(model.policy.optimizer) == pytest.approx(5e-4)
-    assert rate_of(model.critic_optimizer) == pytest.approx(2e-3)
-    model.learn(16, callback=temperatures)
-    assert temperatures.records[-1] == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("kind", ["steps", "search"])
-@pytest.mark.parametrize(("name", "value"), [("learning_rate", 0.25), ("lr_schedule", lambda progress: 0.25)])
-def test_a_learning_rate_set_later_is_the_rate_of_each_optimizer(name, value, kind):
-    model = make(kind, learning_rate=1e-3).learn(16)
-    setattr(model, name, value)
-    model.learn(16, reset_num_timesteps=False)
-    optimizers = [model.policy.optimizer, getattr(model, "critic_optimizer", model.policy.optimizer)]
-    assert [rate_of(optimizer) for optimizer in optimizers] == [0.25, 0.25]
-
-
-@pytest.mark.parametrize("space", [TWO, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3)], ids=str)
-def test_temperature_divides_the_logits(space):
-    models = [make("steps", Corridor(action_space=space), temperature=t, seed=0) for t in (1.0, 0.25)]
-    with th.no_grad():
-        models[0].policy.action_net.weight.mul_(4)
-        models[0].policy.action_net.bias.mul_(4)
-    obs, actions = th.randn(5, 3), th.zeros((5, *space.shape), dtype=th.long if space == TWO else th.float)
-    th.testing.assert_close(*(model.policy.evaluate_actions(obs, actions)[1:] for model in models))
-
-
-def test_a_temperature_that_a_callback_sets_at_the_start_of_a_rollout_acts_in_it():
-    change = Record(lambda model: setattr(model, "temperature", 5.0 + model.num_timesteps), at="rollout_start")
-    temperatures = Record(temperature_of, at="step")
-    make("steps", n_steps=4).learn(8, callback=[change, temperatures])
-    assert temperatures.records == pytest.approx([5.0] * 4 + [9.0] * 4)
-
-
-def test_temperature_may_fall_to_zero_before_the_end():
-    temperatures = Record(temperature_of)
-    make("steps", n_steps=16, temperature=LinearSchedule(1.0, 0.0, 0.5)).learn(64, callback=temperatures)
-    assert temperatures.records == pytest.approx([1.0, 0.5, MIN_TEMPERATURE, MIN_TEMPERATURE])
-    with pytest.raises(ValueError, match="temperature must be in"):
-        make("steps", temperature=0.0)
-
-
-def test_temperature_may_fall_to_zero(tmp_path):
-    """As "linearly to 0" does: the last policy is its own mode, and so is a model loaded at the end."""
-    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, temperature=LinearSchedule(1.0, 0.0, 1.0), device="cpu")
-    with th.no_grad():
-        model.policy.action_net.weight.normal_()
-    model.learn(320)
-    model.save(tmp_path / "cold")
-    cold = REINFORCE.load(tmp_path / "cold", env=model.env)
-    obs = th.randn(200, 4).numpy()
-    sampled, mode = (cold.predict(obs, deterministic=deterministic)[0] for deterministic in (False, True))
-    assert len(set(mode)) == 2 and (sampled == mode).all()
-    cold.learn(64)
-    assert all(parameter.isfinite().all() for parameter in cold.policy.parameters())
-
-
-@pytest.mark.parametrize("use_sde", [True, False])
-def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
-    low = {"policy_kwargs": {"log_std_init": -3.0}, "use_sde": use_sde}
-    kwargs = {"min_std": 0.6, "learning_rate": 0.5, **low}
-    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=16, **kwargs)
-    stds = Record(lambda model: model.policy.log_std.exp().min().item(), at="step")
-    model.learn(160, callback=stds)
-    assert min(stds.records) >= 0.6 - 1e-6 and model.logger.name_to_value["train/std"] >= 0.6 - 1e-6
-    REINFORCE("MlpPolicy", "Pendulum-v1", **low).save(tmp_path / "model")
-    model = REINFORCE.load(tmp_path / "model", env=gym.make("Pendulum-v1"), min_std=0.5, learning_rate=0.0)
-    assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
-
-
-def test_min_std_above_1_is_refused_where_the_deviation_is_no_exponential():
-    arguments = {"use_sde": True, "policy_kwargs": {"use_expln": True, "log_std_init": -3.0}}
-    policy = REINFORCE("MlpPolicy", "Pendulum-v1", min_std=0.5, **arguments).policy
-    assert policy.action_dist.get_std(policy.log_std).min().item() == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="min_std must be at most 1 with use_expln=True, got 5"):
-        REINFORCE("MlpPolicy", "Pendulum-v1", min_std=5.0, **arguments)
-
-
-def test_a_floor_that_a_callback_sets_at_the_start_of_a_rollout_holds_for_the_noise_of_gsde():
-    change = Record(lambda model: setattr(model, "min_std", 100.0), at="rollout_start")
-    arguments = {"use_sde": True, "sde_sample_freq": -1, "policy_kwargs": {"log_std_init": -3.0}}
-    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=64, seed=0, **arguments).learn(64, callback=change)
-    assert np.std(model.rollout_buffer.actions) > 10
-
-
 @pytest.mark.parametrize("force_reset", [True, False])
 def test_set_env_resets_on_request(force_reset):
     model = make("steps", Corridor((7,))).learn(8)
@@ -369,78 +263,6 @@ def test_the_critics_passes_leave_the_actor_and_a_shared_extractor_alone(space, 
     assert moved_by_learning(model, 20) == {name for name in names if "value_net" in name}
 
 
-@all_kinds
-def test_a_policy_that_is_replaced_or_frozen_after_construction(kind):
-    """As in A2C: what is trained is read from the policy at each step."""
-    model, other = make(kind), make(kind)
-    model.policy = other.policy
-    names = {name for name, _ in model.policy.named_parameters()}
-    assert moved_by_learning(model, 64) == {name for name in names if kind == "steps" or "value_net" not in name}
-    model.policy.mlp_extractor.requires_grad_(False)
-    moved = moved_by_learning(model, 64)
-    assert "action_net.weight" in moved and not any("mlp_extractor" in name for name in moved)
-
-
-@pytest.mark.parametrize("change", [{"n_episodes": 8}, {"baseline": "value"}], ids=str)
-def test_the_current_rollout_is_trained_on_with_the_arguments_it_was_collected_with(change):
-    """And what a callback sets at its end waits for the next one."""
-    ends, frozen = [], {"n_episodes": 4, "normalize_by": "episodes", "max_grad_norm": None, "seed": 0}
-    for values in ({}, change):
-        model = make("episodes", make_vec_env(lambda: Corridor((3, 4)), 2, seed=0), **frozen)
-        model.learn(1, callback=Record(lambda model, values=values: vars(model).update(values)))
-        ends.append(model.policy.state_dict())
-    assert plain(ends[0]) == plain(ends[1])
-    assert ("value_net.weight" in moved_by_learning(model, 1)) == ("baseline" in change)
-
-
-def test_a_critic_warms_up_while_the_actor_is_frozen():
-    """As A2C allows."""
-    model = make("steps")
-    for module in (model.policy.mlp_extractor.policy_net, model.policy.action_net):
-        module.requires_grad_(False)
-    moved = moved_by_learning(model, 16)
-    assert "value_net.weight" in moved and all("value_net" in name for name in moved)
-    assert model.logger.name_to_value["train/grad_norm"] == model.logger.name_to_value["train/kl"] == 0
-
-
-class Exponential(th.nn.Module):
-    def forward(self, x):
-        return x.exp()
-
-
-def parametrize_log_std(policy):
-    th.nn.utils.parametrize.register_parametrization(policy, "log_std", Exponential())
-
-
-def share_log_std(policy):
-    policy.log_std = th.nn.Parameter(th.zeros(1))
-
-
-@pytest.mark.parametrize("change", [parametrize_log_std, share_log_std])
-def test_a_log_std_of_another_form(change):
-    class Changed(ActorCriticPolicy):
-        def _build(self, lr_schedule):
-            super()._build(lr_schedule)
-            change(self)
-            self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
-
-    env = make_vec_env(lambda: Corridor((3, 4), lambda t, action: float(t), spaces.Box(-1, 1, (2,))), 2, seed=0)
-    kwargs = {"optimizer_class": th.optim.SGD, "net_arch": [4]}
-    model = make("episodes", env, Changed, n_episodes=4, baseline="optimal", seed=0, policy_kwargs=kwargs).learn(40)
-    assert check_gradient(model).passed
-    assert compare_baselines(model, n_episodes=10)["optimal"].variance.value > 0
-
-
-class ConstantCritic(ActorCriticPolicy):
-    def predict_values(self, obs):
-        return th.zeros(len(obs), 1)
-
-
-def test_a_critic_without_parameters():
-    model = make("steps", policy=ConstantCritic).learn(32)
-    assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
-
-
 @pytest.mark.parametrize(("n_envs", "n_processes", "n_episodes"), [(1, 1, 16), (20, 1, 20), (10, 2, 20)])
 def test_by_default_each_environment_has_an_episode(n_envs, n_processes, n_episodes, monkeypatch):
     monkeypatch.setattr(settings, "rank_and_size", lambda: (0, n_processes))
@@ -448,13 +270,6 @@ def test_by_default_each_environment_has_an_episode(n_envs, n_processes, n_episo
     assert REINFORCE("MlpPolicy", env, baseline="none", device="cpu").n_episodes == n_episodes
     recurrent = RecurrentREINFORCE("MlpLstmPolicy", env, device="cpu")
     assert (recurrent.n_steps, recurrent.n_episodes) == (None, n_episodes)
-
-
-def test_what_a_callback_sets_is_used():
-    values = {"ent_coef": 1e6, "temperature": 3.0, "gamma": 0.5}
-    model = make("steps", max_grad_norm=None).learn(32, callback=At(8, lambda model: vars(model).update(values)))
-    assert model.logger.name_to_value["train/grad_norm"] > 100
-    assert temperature_of(model) == pytest.approx(3)
 
 
 @pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 5}])
@@ -513,13 +328,3 @@ def test_the_policy_can_be_pickled_and_copied():
     policy = make("steps", temperature=0.5).policy
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert all(map(th.equal, policy.parameters(), other.parameters()))
-
-
-@pytest.mark.parametrize(("n_critic_updates", "batch_size", "n_passes"), [(1, 64, 1), (3, 64, 3), (2, 5, 8)])
-def test_one_policy_step_per_rollout_and_the_critics_in_minibatches(n_critic_updates, batch_size, n_passes):
-    model = make("steps", n_steps=16, n_critic_updates=n_critic_updates, batch_size=batch_size)
-    steps = {model.policy.optimizer: [], model.critic_optimizer: []}
-    for optimizer in steps:
-        optimizer.register_step_pre_hook(lambda optimizer, *args: steps[optimizer].append(model.num_timesteps))
-    model.learn(32)
-    assert list(steps.values()) == [[16, 32], [16] * n_passes + [32] * n_passes]

@@ -5,7 +5,7 @@ Faults that other implementations of the policy gradient have or had, and what w
 - a time limit not bootstrapped with a critic, a terminal step bootstrapped: test_rollouts, the critic stands in
 - episodes or environments mixed, the total return in place of the reward-to-go: test_gradient, the step is the formula
 - "the first episodes to finish", which are the short ones: test_rollouts, lengths are drawn without bias
-- several steps on one rollout without a correction: test_contract, one policy step per rollout
+- several steps on one rollout without a correction: test_trained_parameters, one policy step per rollout
 - division by the variance, by a deviation of 0, or of a single sample: test_gradient, standardized; test_fuzz
 - an in-sample optimal baseline, whose gradient vanishes for one episode: test_enumeration, in sample; test_baselines
 - γ^t missing, doubled, or applied to the total return: test_enumeration

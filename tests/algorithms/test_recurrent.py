@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,26 +11,27 @@ from enumeration import ARGUMENTS
 from environments import Corridor, Random, Reused
 from gymnasium import spaces
 from models import plain
-from recurrent_models import SPACES, by_steps, make_recurrent
-from sb3_contrib import RecurrentPPO
-from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from recurrent_models import SPACES, by_steps, make_recurrent, set_n_steps
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common.tensors import flatten, stack, take
-from sb3_reinforce.diagnostics import check_gradient, compare_baselines, landscape
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
 from sb3_reinforce.policies.evaluation import log_prob_of
-from sb3_reinforce.recurrent import MlpLstmPolicy, RecurrentREINFORCE
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 GAMMA = 0.5
+
+
 # float32 holds them exactly
 REWARDS = np.random.default_rng(0).integers(-8, 8, (2, 2, 2)) / 4
+
+
 FIRST_REWARDS = np.random.default_rng(1).integers(-8, 8, (2, 2)) / 4
 
 
@@ -151,12 +151,6 @@ def outputs_of(policy, episode):
     return logits[-1], float(values[-1])
 
 
-def set_n_steps(model):
-    """From the second rollout on."""
-    if model.num_timesteps > 0:
-        model.n_steps, model.n_episodes = 4, None
-
-
 def copy_of(buffer):
     return buffer.episode_starts.copy(), buffer.log_probs.copy()
 
@@ -269,13 +263,6 @@ def test_cudnn_is_not_asked_for_gradients_in_evaluation_mode(monkeypatch):
     assert (True, False) in passes and (True, True) not in passes
 
 
-class OneStep(MlpLstmPolicy):
-    """Overrides what is called for single steps alone."""
-
-    def get_distribution(self, obs, lstm_states, episode_starts):
-        return super().get_distribution(obs, lstm_states, episode_starts)
-
-
 @pytest.mark.parametrize("n_steps", [7, None])
 def test_a_vec_env_may_reuse_its_arrays(n_steps):
     ends = []
@@ -296,65 +283,6 @@ def test_a_memory_without_dropout_stays_in_training_mode(dropout):
     assert not policy.mlp_extractor.training
 
 
-def memory(**policy_kwargs):
-    return lambda env: make_recurrent(env=env, policy_kwargs=policy_kwargs)
-
-
-def predict(*arguments):
-    return lambda env: make_recurrent(env=env, double=False).predict(*arguments)
-
-
-THREE = np.zeros((3, 4), dtype=np.float32)
-TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
-
-
-def observing(space):
-    """A model for observations in a space."""
-    name = "MultiInputLstmPolicy" if isinstance(space, spaces.Dict) else "MlpLstmPolicy"
-    return lambda env: RecurrentREINFORCE(name, Random(space, spaces.Discrete(2)))
-
-
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (lambda env: REINFORCE("MlpLstmPolicy", env), "RecurrentREINFORCE"),
-        (lambda env: RecurrentREINFORCE("MlpPolicy", env), "policy must be a class or one of .*MlpLstmPolicy"),
-        (lambda env: RecurrentREINFORCE(RecurrentActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
-        (lambda env: RecurrentREINFORCE(ActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
-        (lambda env: RecurrentREINFORCE(OneStep, env), "override sequence_distribution too"),
-        (
-            lambda env: RecurrentREINFORCE("MultiInputLstmPolicy", env),
-            "policy must be MlpLstmPolicy for observations in",
-        ),
-        (observing(spaces.MultiDiscrete([2, 3])), "observation_space must have no MultiDiscrete"),
-        (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "MultiDiscrete part, .* as a Box, got Dict"),
-        (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
-        (
-            lambda env: landscape(RecurrentPPO("MlpLstmPolicy", env, device="cpu")),
-            "must have no memory, got RecurrentActorCriticPolicy",
-        ),
-        (memory(memory="LSTM"), "memory must be one of 'lstm', 'gru', 'rnn'"),
-        (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
-        (
-            memory(shared_lstm=True, enable_critic_lstm=False, share_features_extractor=False),
-            "share_features_extractor",
-        ),
-        (memory(lstm_hidden_size=0), "lstm_hidden_size must be"),
-        (memory(n_lstm_layers=0), "n_lstm_layers must be"),
-        (memory(lstm_kwargs={"batch_first": True}), "lstm_kwargs must be a dict with some of bias, dropout"),
-        (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
-        (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
-        (predict(THREE, TWO_STATES), r"state must be .* of shape \(1, 3, 4\)"),
-        (predict(THREE, 3), "state must be .*; got 3"),
-        (predict(THREE, None, np.ones(2, dtype=bool)), r"episode_start must have shape \(3,\), got \(2,\)"),
-        (predict((THREE, {})), "observation must not be a tuple"),
-    ],
-)
-def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        call(make_vec_env("CartPole-v1"))
-
-
 @pytest.mark.parametrize(
     ("algorithm", "policy"),
     [(REINFORCE, "MlpPolicy"), (RecurrentREINFORCE, "MlpLstmPolicy"), (FiniteDifference, "LinearPolicy")],
@@ -371,73 +299,3 @@ def test_the_log_has_the_name_of_the_class_or_the_given_one(algorithm, policy, t
     names = [algorithm.__name__, "Own", "mine"]
     assert sorted({*given}) == sorted(names)
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}_1" for name in names}
-
-
-@pytest.mark.parametrize("at", ["rollout_start", "step", "rollout_end"])
-def test_episodes_go_on_after_a_callback_has_set_n_steps(at):
-    """The first rollout of fixed length begins with a reset, and no other one."""
-    env = make_vec_env(lambda: Corridor((3, 40)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=2, seed=0, device="cpu")
-    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].tolist())
-    model.learn(100, callback=[starts, Record(set_n_steps, at=at)])
-    assert all(starts.records[1])
-    assert not any(map(all, starts.records[2:]))
-
-
-def test_episodes_go_on_after_an_error_at_the_start_of_a_rollout():
-    def fail(model):
-        if model.num_timesteps > 0:
-            model.n_steps, model.n_episodes = None, -1
-
-    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=4, seed=0, device="cpu")
-    with pytest.raises(ValueError, match="n_episodes"):
-        model.learn(100, Record(fail, at="rollout_start"))
-    model.n_steps, model.n_episodes = 4, None
-    model.learn(8, reset_num_timesteps=False)
-    assert not model.rollout_buffer.episode_starts[0].any()
-
-
-def test_episodes_without_their_memory_are_reset():
-    """A rollout of whole episodes keeps no states, and its last episodes are cut."""
-    env = make_vec_env(lambda: Corridor((3, 7)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=3, seed=0, device="cpu").learn(1)
-    assert not all(model._last_episode_starts)
-    set_n_steps(model)
-    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].all())
-    model.learn(40, starts, reset_num_timesteps=False)
-    assert starts.records[0]
-    assert not all(starts.records)
-
-
-def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout():
-    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=5, learning_rate=0.0, seed=0, device="cpu")
-
-    def fail(model):
-        if model.num_timesteps == 30:
-            raise RuntimeError("at the end of the third rollout")
-
-    with pytest.raises(RuntimeError, match="third rollout"):
-        model.learn(100, Record(fail))
-    # The state after the fifteen steps is the one that a single rollout of fifteen ends with
-    env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
-    whole = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=15, learning_rate=0.0, seed=0, device="cpu").learn(30)
-    th.testing.assert_close(model._next_state[:, 0], whole._next_state[:, 0])
-    assert model.learn(10, reset_num_timesteps=False).num_timesteps == 40
-
-
-def test_a_trained_model_can_be_pickled():
-    model = make_recurrent(env=make_vec_env("CartPole-v1", 2), double=False, n_steps=8).learn(32)
-    copy = cloudpickle.loads(cloudpickle.dumps(model))
-    assert np.array_equal(copy._next_state, model._next_state)
-
-
-def test_one_environment_alone_needs_no_arrays_of_flags():
-    """As with RecurrentPPO."""
-    model = make_recurrent(env="CartPole-v1", double=False)
-    obs = np.ones(4, dtype=np.float32)
-    _, state = model.predict(obs)
-    expected = model.predict(obs, state, np.array([True]), deterministic=True)
-    for flag, given in ((True, state), ([True], list(state)), (np.ones((1, 1)), state)):
-        np.testing.assert_equal(model.predict(obs, given, flag, deterministic=True), expected)

@@ -4,19 +4,15 @@ from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from inspect import signature
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
-from environments import Corridor, Random
-from gymnasium import spaces
 from models import KINDS, both, make, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -26,9 +22,14 @@ from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARG
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
 
 NAN, INF = float("nan"), float("inf")
+
+
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
 
+
 NO_NUMBERS = ["x", True, [1], 1j, None]
+
+
 WRONG = {
     "check_number": [*NO_NUMBERS, NAN, INF, -INF],
     "CheckedSchedule": [*NO_NUMBERS, -1, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
@@ -275,105 +276,10 @@ def test_a_callback_may_replace_a_schedule(kind):
 
 
 @both
-@pytest.mark.parametrize("env", [None, 3, gym.make_vec("CartPole-v1", 2)], ids=["None", "3", "VectorEnv"])
-def test_env_must_be_an_environment(kind, env):
-    with pytest.raises(TypeError, match="env must be"):
-        make(kind, env)
-    with pytest.raises(TypeError, match="env must be"):
-        make(kind).set_env(env)
-
-
-@both
-def test_learning_after_a_load_needs_an_environment(kind, tmp_path):
-    make(kind).save(tmp_path / "model")
-    model = KINDS[kind][0].load(tmp_path / "model", device="cpu")
-    with pytest.raises(ValueError, match="env is None"):
-        model.learn(8)
-    model.set_env(make_vec_env("CartPole-v1", 1))
-    assert model.learn(8).num_timesteps >= 8
-
-
-@both
 def test_verbose_may_be_a_flag(kind, tmp_path):
     assert [make(kind, verbose=value).verbose for value in (True, False, 2)] == [1, 0, 2]
     make(kind).save(tmp_path / "model")
     assert KINDS[kind][0].load(tmp_path / "model", verbose=True).verbose == 1
-
-
-@both
-def test_load_checks_the_arguments_that_it_replaces(kind, tmp_path):
-    make(kind).save(tmp_path / "model")
-    wrong = {"learning_rate": NAN, "seed": -1, "max_grad_norm": -1, "verbose": "x", "gama": 0.9, "stats_window_size": 5}
-    wrong |= {"gamma": 2.0, "n_episodes": 4, "baseline": "x"} if kind == "steps" else {"estimator": "x", "n_top": 9}
-    for name, value in wrong.items():
-        with pytest.raises((TypeError, ValueError), match=name):
-            KINDS[kind][0].load(tmp_path / "model", **{name: value})
-    assert KINDS[kind][0].load(tmp_path / "model", max_grad_norm=0.1, seed=3, device="cpu").max_grad_norm == 0.1
-
-
-@both
-def test_load_replaces_arguments_of_a_subclass_and_those_that_were_not_saved(kind, tmp_path):
-    algorithm = KINDS[kind][0]
-
-    class Own(algorithm):
-        def __init__(self, *args, own=1, **kwargs):
-            super().__init__(*args, **kwargs)
-            self.own = own
-
-    chosen = "n_steps" if kind == "steps" else "n_delta"
-    Own("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model", exclude=["max_grad_norm", chosen])
-    loaded = Own.load(tmp_path / "model", max_grad_norm=0.1, own=2, device="cpu", **{chosen: 8})
-    assert type(loaded) is Own and (loaded.max_grad_norm, loaded.own) == (0.1, 2)
-    loaded.save(tmp_path / "model", exclude=["own"])
-    assert Own.load(tmp_path / "model", own=3, device="cpu").own == 3
-    assert type("Further", (Own,), {}).load(tmp_path / "model", own=3, device="cpu").own == 3
-    for name in ("gama", "kwargs", "_init_setup_model"):
-        with pytest.raises(TypeError, match=f"load cannot replace {name}"):
-            Own.load(tmp_path / "model", **{name: 1})
-
-
-@both
-def test_load_checks_the_argument_for_the_random_state(kind, tmp_path):
-    model = make(kind)
-    model.save(tmp_path / "with")
-    for value in ("no", 1, None):
-        with pytest.raises(TypeError, match="restore_random_state"):
-            KINDS[kind][0].load(tmp_path / "with", restore_random_state=value)
-    model.save(tmp_path / "without", exclude=["_random_state"])
-    before = th.get_rng_state()
-    with pytest.raises(ValueError, match=r"restore_random_state must be False for .*without"):
-        KINDS[kind][0].load(tmp_path / "without", restore_random_state=True)
-    assert th.equal(th.get_rng_state(), before)
-    KINDS[kind][0].load(tmp_path / "without", device="cpu")
-
-
-@both
-@pytest.mark.parametrize("value", ["gpu9", 3])
-def test_a_wrong_device_is_named_where_a_file_is_read(kind, value, tmp_path):
-    model = make(kind)
-    model.save(tmp_path / "model")
-    for read in (KINDS[kind][0].load, model.set_parameters):
-        with pytest.raises((TypeError, ValueError), match=f"device must be .*{value}"):
-            read(tmp_path / "model", device=value)
-
-
-@both
-def test_a_wrong_flag_is_named(kind):
-    model = make(kind)
-    with pytest.raises(TypeError, match="exact_match must be True or False, got 'no'"):
-        model.set_parameters(model.get_parameters(), exact_match="no")
-    with pytest.raises(TypeError, match="force_reset must be True or False, got 'no'"):
-        model.set_env(make_vec_env("CartPole-v1", 1), force_reset="no")
-
-
-@both
-def test_set_env_checks_the_number_and_the_spaces(kind):
-    model = make(kind)
-    with pytest.raises(ValueError, match="num_envs=1, as the model has, got 3"):
-        model.set_env(make_vec_env("CartPole-v1", 3))
-    with pytest.raises(ValueError, match="spaces do not match"):
-        model.set_env(gym.make("Pendulum-v1"))
-    assert model.learn(8).num_timesteps >= 8
 
 
 @both
@@ -385,87 +291,6 @@ def test_integers_of_numpy(kind, tmp_path):
     model.save(tmp_path / "model")
     given = {name: np.int64(value) for name, value in integers.items() if name != "stats_window_size"}
     type(model).load(tmp_path / "model", env=gym.make("CartPole-v1"), **given).learn(16)
-
-
-@both
-@pytest.mark.parametrize(
-    ("name", "space", "problem"),
-    [
-        ("observation_space", spaces.Box(0, 1, (3, 0)), " must not be empty"),
-        ("observation_space", spaces.Dict({}), " must not be empty"),
-        ("observation_space", spaces.Dict(a=spaces.Box(0, 1, (0,))), r"\['a'\] must not be empty"),
-        ("observation_space", spaces.Tuple([spaces.Discrete(2)]), " must be Box"),
-        ("observation_space", spaces.Text(3), " must be Box"),
-        ("observation_space", spaces.Discrete(4, start=2), " must start at 0"),
-        ("observation_space", spaces.MultiDiscrete([2, 2], start=[0, 1]), " must start at 0"),
-        ("observation_space", spaces.Box(-1, 1, ()), " must have a dimension"),
-        ("observation_space", spaces.Dict(x=spaces.Box(-1, 1, ())), r"\['x'\] must have a dimension"),
-        ("observation_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), " must have one dimension"),
-        ("action_space", spaces.Box(-1, 1, (0,)), " must not be empty"),
-        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), " must have finite bounds"),
-        ("action_space", spaces.MultiBinary([2, 3]), " must have one dimension"),
-        ("action_space", spaces.MultiDiscrete([[2, 3], [4, 5]]), " must have one dimension"),
-        ("action_space", spaces.Tuple([spaces.Discrete(2)]), " must be Box"),
-        ("action_space", spaces.Dict(a=spaces.Discrete(2)), " must be Box"),
-    ],
-)
-def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
-    env = Corridor()
-    setattr(env, name, space)
-    with pytest.raises(ValueError, match=f"^{name}{problem}"):
-        make(kind, env, "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy")
-
-
-@both
-@pytest.mark.parametrize(
-    "env",
-    [
-        type("Task", (gym.Env,), {"observation_space": spaces.Box(-1, 1, (3,)), "action_space": spaces.Discrete(2)}),
-        SimpleNamespace(observation_space=spaces.Box(-1, 1, (3,)), action_space=spaces.Discrete(2)),
-    ],
-    ids=["class", "other library"],
-)
-def test_what_is_no_environment(env, kind):
-    with pytest.raises(TypeError, match=r"env must be a gymnasium.Env, a VecEnv or a registered id, got"):
-        make(kind, env)
-
-
-@both
-def test_a_policy_goes_with_its_observations(kind):
-    with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):
-        make(kind, Corridor(), "MultiInputPolicy")
-    with pytest.raises(ValueError, match="MultiInputPolicy"):
-        make(kind, Random(spaces.Dict(a=spaces.Box(0, 1))))
-
-
-def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
-    def loaded(n_envs, **kwargs):
-        return REINFORCE.load(tmp_path / "model", make_vec_env("CartPole-v1", n_envs), device="cpu", **kwargs)
-
-    REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 2), device="cpu").save(tmp_path / "model")
-    assert (loaded(2).n_steps, loaded(2).n_episodes) == (32, None)
-    other = loaded(20, baseline="leave_one_out")
-    assert (other.n_steps, other.n_episodes) == (None, 20)
-    assert (loaded(2, n_episodes=4).n_steps, loaded(2, n_episodes=4).n_episodes) == (None, 4)
-    # What the user gives stays, also where it is what would have been chosen
-    assert loaded(2, n_steps=32, baseline="leave_one_out").n_steps == 32
-    assert loaded(20, custom_objects={"n_steps": 64}).n_steps == 64
-    given = REINFORCE.load(tmp_path / "model", None, "cpu", {"n_episodes": 4})
-    assert (given.n_steps, given.n_episodes) == (None, 4)
-    changed = loaded(2)
-    changed.baseline = "time_mean"
-    changed.save(tmp_path / "model")
-    assert loaded(2).n_steps == 32
-    make("steps", n_steps=32).save(tmp_path / "model")
-    with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both given"):
-        loaded(1, n_episodes=4)
-    make("search", n_delta=None).save(tmp_path / "model")
-    n_deltas = [
-        FiniteDifference.load(tmp_path / "model", device="cpu", estimator=each).n_delta
-        for each in ("central", "regression")
-    ]
-    assert n_deltas[1] == 2 * n_deltas[0]
-    assert FiniteDifference.load(tmp_path / "model", device="cpu", n_top=2).n_top == 2
 
 
 @pytest.mark.parametrize("kind", ["steps", "episodes"])

@@ -1,6 +1,5 @@
 """The gradient check passes where the gradient is right, and names the line where it is wrong."""
 
-from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -8,30 +7,15 @@ import numpy as np
 import pytest
 import torch as th
 from environments import Corridor, Tree
+from gradient_checks import ACTION_SPACES, HalfDetached, corridor, with_noise
 from gymnasium import spaces
-from models import FromDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
-from sb3_reinforce.estimation import weights
 from sb3_reinforce.recurrent import RecurrentREINFORCE
-
-ACTION_SPACES = [
-    spaces.Discrete(3),
-    spaces.Discrete(3, start=4),
-    spaces.Box(-1, 1, (2,)),
-    spaces.MultiDiscrete([2, 3]),
-    spaces.MultiBinary(2),
-]
-
-
-def corridor(action_space=None):
-    """Time limits, rewards that differ, and episodes of two lengths."""
-    return Corridor((3, 7), lambda t, action: 1.0 + t + np.sum(action), action_space=action_space, truncate=True)
 
 
 @pytest.mark.parametrize("action_space", ACTION_SPACES)
@@ -113,11 +97,6 @@ def test_policies_that_are_curved_much_pass(activation_fn):
     assert table["scores"].passed and table["surrogate"].passed, table
 
 
-def with_noise(log_std_init, policy="MlpPolicy", n_actions=1):
-    env = corridor(spaces.Box(-1, 1, (n_actions,)))
-    return REINFORCE(policy, env, device="cpu", seed=0, policy_kwargs={"log_std_init": log_std_init})
-
-
 def without_gradient(model, *names):
     for name, parameter in model.policy.named_parameters():
         parameter.requires_grad_(not name.startswith(names))
@@ -159,35 +138,6 @@ def test_gsde_cuts_its_scores_unless_it_learns_features():
     assert check_gradient(model).passed
 
 
-def altered(log_prob=lambda log_prob, actions: log_prob, actions=lambda actions: actions):
-    """A policy whose ``evaluate_actions`` changes the actions or their log π."""
-
-    class Altered(ActorCriticPolicy):
-        def evaluate_actions(self, obs, given):
-            values, found, entropy = super().evaluate_actions(obs, actions(given))
-            return values, log_prob(found, given), entropy
-
-    return Altered
-
-
-# As if for a loss
-NEGATED = altered(lambda log_prob, actions: -log_prob)
-# The next action instead of the one that was taken
-SHIFTED = altered(actions=lambda actions: (actions + 1) % 3)
-# A constant per action, with which log π no longer is a log-probability
-OFFSET = altered(lambda log_prob, actions: log_prob + 0.1 * actions)
-DETACHED = altered(lambda log_prob, actions: log_prob.detach())
-
-
-class HalfDetached(ActorCriticPolicy):
-    """Cuts the graph between the network and the logits' layer."""
-
-    def evaluate_actions(self, obs, actions):
-        latent = self.mlp_extractor.forward_actor(self.extract_features(obs)).detach()
-        distribution = self._get_action_dist_from_latent(latent)
-        return self.predict_values(obs), distribution.log_prob(actions), distribution.entropy()
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_memory_that_larger_weights_would_make_explode_passes(seed):
     memory = {"memory": "rnn", "lstm_hidden_size": 64, "lstm_kwargs": {"nonlinearity": "relu"}}
@@ -199,138 +149,6 @@ def test_a_new_policy_whose_last_layer_alone_learns_is_named():
     """The last layer's weights are small, and the scores of the others with them."""
     env = make_vec_env("CartPole-v1", 2, seed=0)
     assert check_gradient(REINFORCE(HalfDetached, env, device="cpu", seed=0)).failures == ["scores"]
-
-
-class Stale(ActorCriticPolicy):
-    """Samples from the policy as it was made, and reports the present log π."""
-
-    def _build(self, lr_schedule):
-        super()._build(lr_schedule)
-        self.first = None
-
-    def forward(self, obs, deterministic=False):
-        if self.first is None:
-            self.first = self.get_distribution(obs).distribution.logits[:1].detach()
-        actions = th.distributions.Categorical(logits=self.first.expand(len(obs), -1)).sample()
-        values, log_prob, _ = self.evaluate_actions(obs, actions)
-        return actions, values, log_prob
-
-
-class WithoutBias(ActorCriticPolicy):
-    def _build(self, lr_schedule):
-        super()._build(lr_schedule)
-        self.action_net = th.nn.Linear(self.action_net.in_features, self.action_net.out_features, bias=False)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
-
-
-class OwnHead(FromDistribution):
-    """Its distribution comes from another layer."""
-
-    def _build(self, lr_schedule):
-        super()._build(lr_schedule)
-        self.head = th.nn.Linear(self.action_net.in_features, self.action_net.out_features)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
-
-    def get_distribution(self, obs):
-        return self.action_dist.proba_distribution(
-            self.head(self.mlp_extractor.forward_actor(self.extract_features(obs)))
-        )
-
-
-@pytest.mark.parametrize(("policy", "failures"), [(Stale, ["sign"]), (WithoutBias, []), (OwnHead, [])])
-def test_policies_with_other_heads_and_samples(policy, failures):
-    model = REINFORCE(policy, make_vec_env("CartPole-v1", 2, seed=0), device="cpu", seed=0)
-    assert check_gradient(model).failures == failures
-
-
-class WrongReturns(REINFORCE):
-    """Forgets the discount factor of what is still to come."""
-
-    def collect_rollouts(self, *args, **kwargs):
-        going_on = super().collect_rollouts(*args, **kwargs)
-        self.rollout = replace(self.rollout, returns=self.rollout.returns + self.rollout.rewards)
-        return going_on
-
-
-class WrongWeights(REINFORCE):
-    """Scales the weights on their way to training."""
-
-    def collect_rollouts(self, env, callback, rollout_buffer, n_rollout_steps):
-        going_on = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        rollout_buffer.advantages *= 1.1
-        return going_on
-
-
-class TwoSteps(REINFORCE):
-    """Takes a second step from the same data."""
-
-    def train(self):
-        super().train()
-        super().train()
-
-
-def failures(algorithm=REINFORCE, policy="MlpPolicy"):
-    model = algorithm(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
-    with th.no_grad():
-        # A policy that is far from uniform
-        model.policy.action_net.weight.mul_(100)
-    return check_gradient(model).failures
-
-
-@pytest.mark.parametrize(
-    ("wrong", "lines"),
-    [
-        ({"policy": NEGATED}, ["log_prob", "sign"]),
-        ({"policy": SHIFTED}, ["log_prob", "sign"]),
-        ({"policy": OFFSET}, ["log_prob"]),
-        ({"policy": HalfDetached}, ["scores"]),
-        ({"algorithm": WrongReturns}, ["returns", "weights"]),
-        ({"algorithm": WrongWeights}, ["weights"]),
-        ({"algorithm": TwoSteps}, ["surrogate"]),
-    ],
-)
-def test_what_is_wrong_is_named(wrong, lines):
-    assert failures(**wrong) == lines
-
-
-def test_weights_are_not_checked_by_what_computes_them(monkeypatch):
-    monkeypatch.setattr(weights, "check_baseline", lambda baseline, rollout: -baseline)
-    assert failures() == ["weights"]
-
-
-def test_negation_is_seen_in_every_action_space():
-    for action_space in ACTION_SPACES:
-        model = REINFORCE(NEGATED, corridor(action_space), baseline="none", device="cpu", seed=0)
-        assert {"log_prob", "sign"} <= set(check_gradient(model).failures)
-
-
-class Mirrored(ActorCriticPolicy):
-    """Acts opposite to what it evaluates, with the log π of what it returns."""
-
-    def forward(self, obs, deterministic=False):
-        actions, values, _ = super().forward(obs, deterministic)
-        return -actions, values, self.evaluate_actions(obs, -actions)[1]
-
-
-@pytest.mark.parametrize("policy", [NEGATED, Mirrored])
-@pytest.mark.parametrize("log_std_init", [-3.0, 0.0, 2.0, 4.0])
-def test_a_wrong_sign_is_seen_with_little_and_with_much_noise(log_std_init, policy):
-    assert check_gradient(with_noise(log_std_init, policy, n_actions=2))["sign"].error == 1
-
-
-@pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])
-def test_a_policy_without_randomness_does_not_pass_unchecked(policy):
-    model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
-    with th.no_grad():
-        model.policy.action_net.bias.copy_(th.tensor([80.0, 0.0, 0.0]))
-    table = check_gradient(model)
-    assert np.isnan(table["sign"].error)
-    assert "sign" in table.failures
-
-
-def test_a_policy_that_cannot_be_differentiated_is_named():
-    with pytest.raises(ValueError, match="Altered cannot be differentiated"):
-        check_gradient(REINFORCE(DETACHED, Tree(), device="cpu", baseline="none"))
 
 
 def test_the_table_says_what_its_columns_are():

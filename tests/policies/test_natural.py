@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch as th
-from callbacks import Record
 from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
@@ -16,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.distributions import kl_divergence
@@ -24,21 +22,13 @@ from torch.distributions import kl_divergence
 from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.estimation import BASELINES
-from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies import natural
-from sb3_reinforce.policies.evaluation import (
-    action_distribution,
-    log_prob_of,
-    route_of,
-    sampled_divergence,
-    some_steps,
-)
+from sb3_reinforce.policies.evaluation import action_distribution
 from sb3_reinforce.policies.natural import conjugate_gradients, line_search, natural_step
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 # The states of the tree, as often as a rollout might visit them
 OBS = th.eye(3)[[0, 0, 0, 1, 2, 2]]
-PARAMETERS = th.tensor([[1.0, -0.3, 0.2], [0.5, 0.1, -0.4]], dtype=th.float64)
 
 
 def fisher(policy, obs):
@@ -162,7 +152,11 @@ def sums(action_space):
 
 
 BOX = spaces.Box(-1, 1, (2,))
+
+
 MASKED = InvalidActionEnvMultiDiscrete([3, 4], n_invalid_actions=3)
+
+
 MODELS = {
     "Discrete": ("MlpPolicy", sums(spaces.Discrete(3, start=1)), {}),
     "MultiDiscrete": ("MlpPolicy", sums(spaces.MultiDiscrete([2, 3])), {}),
@@ -301,23 +295,6 @@ def test_the_critic_does_not_move_shared_features():
     assert th.equal(*features)
 
 
-def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
-    policy = make_model().policy
-    route = route_of(policy)
-    with th.no_grad():
-        old = policy.get_distribution(OBS).distribution.logits.clone()
-        policy.action_net.weight.copy_(PARAMETERS)
-        new = policy.get_distribution(OBS).distribution.logits.clone()
-    expected = (old.exp() * (old - new)).sum(1).mean()
-    # Each action as often as the old policy takes it
-    found = 0.0
-    for i in range(len(OBS)):
-        for action in range(2):
-            k3 = sampled_divergence(policy, route, OBS[i : i + 1], th.tensor([action]), old[i, action])
-            found += float(old[i, action].exp()) * k3 / len(OBS)
-    assert found == pytest.approx(float(expected), rel=1e-10)
-
-
 def test_a_target_may_fall_to_0_also_in_a_saved_model(tmp_path, recwarn):
     env = make_vec_env("CartPole-v1", 2, seed=0)
     schedule = LinearSchedule(0.02, 0.0, 1.0)
@@ -326,70 +303,3 @@ def test_a_target_may_fall_to_0_also_in_a_saved_model(tmp_path, recwarn):
     found = divergences_of(REINFORCE.load(tmp_path / "model", env=env), 256)
     np.testing.assert_allclose(found, [0.01, 0.0], rtol=0.2)
     assert not recwarn
-
-
-class Unsteady(FlattenExtractor):
-    """Its features differ in training mode, in which each pass changes them."""
-
-    def __init__(self, space):
-        super().__init__(space)
-        self.norm = th.nn.BatchNorm1d(self.features_dim)
-
-    def forward(self, observations):
-        return th.nn.functional.dropout(self.norm(super().forward(observations)), 0.5, self.training)
-
-
-LOGGED = {
-    "MLP": ("MlpPolicy", "CartPole-v1", {}),
-    "gSDE": ("MlpPolicy", "Pendulum-v1", {"use_sde": True}),
-    "images": ("CnnPolicy", FakeImageEnv(screen_height=40, screen_width=40, n_channels=1), {}),
-    "dropout": ("MlpPolicy", "CartPole-v1", {"policy_kwargs": {"features_extractor_class": Unsteady}}),
-    "memory": ("MlpLstmPolicy", "CartPole-v1", {}),
-}
-
-
-@pytest.mark.parametrize("name", LOGGED)
-def test_the_logged_divergence_of_the_optimizers_step_is_the_sampled_one(name):
-    policy, env, kwargs = LOGGED[name]
-    algorithm = RecurrentREINFORCE if name == "memory" else REINFORCE
-    old = Record(lambda model: deepcopy(model.policy.state_dict()))
-    model = algorithm(policy, env, n_steps=64, learning_rate=0.01, seed=0, device="cpu", **kwargs).learn(64, old)
-    model.policy.set_training_mode(False)
-    batch = training_batch(model.rollout, model.rollout_buffer, normalize=False)
-    log_probs = []
-    for state in (model.policy.state_dict(), old.records[0]):
-        model.policy.load_state_dict(state)
-        log_probs.append(log_prob_of(model.policy, batch.observations, batch.actions).double().detach())
-    log_ratio = log_probs[0] - log_probs[1]
-    expected = float((log_ratio.exp() - 1 - log_ratio).mean())
-    assert 1e-6 < expected == pytest.approx(model.logger.name_to_value["train/kl"], rel=1e-2)
-
-
-class Differentiating(ActorCriticPolicy):
-    """Its log π needs a gradient, which is nothing under no_grad."""
-
-    def evaluate_actions(self, obs, actions):
-        obs = obs.requires_grad_()
-        values, log_prob, entropy = super().evaluate_actions(obs, actions)
-        (slope,) = th.autograd.grad(log_prob.sum(), obs, create_graph=True)
-        return values, log_prob - 1e-3 * slope.square().sum(1), entropy
-
-
-def test_a_policy_that_differentiates_has_a_divergence_too():
-    model = REINFORCE(Differentiating, "CartPole-v1", n_steps=64, seed=0, device="cpu").learn(64)
-    assert model.logger.name_to_value["train/kl"] > 0
-
-
-def test_a_log_changes_no_statistics():
-    """The passes in training mode are the policy's; the critic's evaluate a shared extractor as it is."""
-    kwargs = {"features_extractor_class": Unsteady}
-    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs=kwargs, seed=0).learn(128)
-    assert model.policy.features_extractor.norm.num_batches_tracked == 2
-
-
-@pytest.mark.parametrize(("n", "expected"), [(50, 50), (100, 64), (4096, 512)])
-def test_an_estimate_takes_different_steps(n, expected):
-    policy = make_model().policy
-    obs, actions = some_steps(policy, {"numbers": th.arange(n)}, th.arange(n))
-    assert len(actions.unique()) == len(actions) == expected
-    assert th.equal(obs["numbers"], actions)

@@ -1,0 +1,94 @@
+"""What is trained is read from the policy at each step, also from one that was replaced, frozen or changed."""
+
+import pytest
+import torch as th
+from callbacks import Record
+from environments import Corridor
+from gymnasium import spaces
+from models import all_kinds, make, moved_by_learning, plain
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+
+
+@all_kinds
+def test_a_policy_that_is_replaced_or_frozen_after_construction(kind):
+    """As in A2C: what is trained is read from the policy at each step."""
+    model, other = make(kind), make(kind)
+    model.policy = other.policy
+    names = {name for name, _ in model.policy.named_parameters()}
+    assert moved_by_learning(model, 64) == {name for name in names if kind == "steps" or "value_net" not in name}
+    model.policy.mlp_extractor.requires_grad_(False)
+    moved = moved_by_learning(model, 64)
+    assert "action_net.weight" in moved and not any("mlp_extractor" in name for name in moved)
+
+
+@pytest.mark.parametrize("change", [{"n_episodes": 8}, {"baseline": "value"}], ids=str)
+def test_the_current_rollout_is_trained_on_with_the_arguments_it_was_collected_with(change):
+    """And what a callback sets at its end waits for the next one."""
+    ends, frozen = [], {"n_episodes": 4, "normalize_by": "episodes", "max_grad_norm": None, "seed": 0}
+    for values in ({}, change):
+        model = make("episodes", make_vec_env(lambda: Corridor((3, 4)), 2, seed=0), **frozen)
+        model.learn(1, callback=Record(lambda model, values=values: vars(model).update(values)))
+        ends.append(model.policy.state_dict())
+    assert plain(ends[0]) == plain(ends[1])
+    assert ("value_net.weight" in moved_by_learning(model, 1)) == ("baseline" in change)
+
+
+def test_a_critic_warms_up_while_the_actor_is_frozen():
+    """As A2C allows."""
+    model = make("steps")
+    for module in (model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        module.requires_grad_(False)
+    moved = moved_by_learning(model, 16)
+    assert "value_net.weight" in moved and all("value_net" in name for name in moved)
+    assert model.logger.name_to_value["train/grad_norm"] == model.logger.name_to_value["train/kl"] == 0
+
+
+class Exponential(th.nn.Module):
+    def forward(self, x):
+        return x.exp()
+
+
+def parametrize_log_std(policy):
+    th.nn.utils.parametrize.register_parametrization(policy, "log_std", Exponential())
+
+
+def share_log_std(policy):
+    policy.log_std = th.nn.Parameter(th.zeros(1))
+
+
+@pytest.mark.parametrize("change", [parametrize_log_std, share_log_std])
+def test_a_log_std_of_another_form(change):
+    class Changed(ActorCriticPolicy):
+        def _build(self, lr_schedule):
+            super()._build(lr_schedule)
+            change(self)
+            self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    env = make_vec_env(lambda: Corridor((3, 4), lambda t, action: float(t), spaces.Box(-1, 1, (2,))), 2, seed=0)
+    kwargs = {"optimizer_class": th.optim.SGD, "net_arch": [4]}
+    model = make("episodes", env, Changed, n_episodes=4, baseline="optimal", seed=0, policy_kwargs=kwargs).learn(40)
+    assert check_gradient(model).passed
+    assert compare_baselines(model, n_episodes=10)["optimal"].variance.value > 0
+
+
+class ConstantCritic(ActorCriticPolicy):
+    def predict_values(self, obs):
+        return th.zeros(len(obs), 1)
+
+
+def test_a_critic_without_parameters():
+    model = make("steps", policy=ConstantCritic).learn(32)
+    assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
+
+
+@pytest.mark.parametrize(("n_critic_updates", "batch_size", "n_passes"), [(1, 64, 1), (3, 64, 3), (2, 5, 8)])
+def test_one_policy_step_per_rollout_and_the_critics_in_minibatches(n_critic_updates, batch_size, n_passes):
+    model = make("steps", n_steps=16, n_critic_updates=n_critic_updates, batch_size=batch_size)
+    steps = {model.policy.optimizer: [], model.critic_optimizer: []}
+    for optimizer in steps:
+        optimizer.register_step_pre_hook(lambda optimizer, *args: steps[optimizer].append(model.num_timesteps))
+    model.learn(32)
+    assert list(steps.values()) == [[16, 32], [16] * n_passes + [32] * n_passes]
