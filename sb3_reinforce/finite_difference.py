@@ -80,8 +80,9 @@ class FiniteDifference(BasePolicyGradient):
     :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
         the start from differences, but environments idle until the longest episode of a round ends
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
-    :param standardize_utilities: Measure the gradient in standard deviations of the utilities per ``delta_std``, as
-        ARS does: the step then depends neither on the scale of the rewards nor on ``delta_std``
+    :param standardize_utilities: Measure the gradient in standard deviations of all utilities (ARS: of those that
+        ``n_top`` leaves) per ``delta_std``: the step then depends neither on the scale of the rewards nor on
+        ``delta_std``
     :param deterministic: Whether candidates take their most likely actions, or sample
     :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
     :param max_episode_steps: The length beyond which an episode raises an error

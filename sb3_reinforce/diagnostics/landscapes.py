@@ -29,7 +29,7 @@ class CandidateUtility:
 
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility
-    :param seed: Seed of the first episode
+    :param seed: Seed of the random number from which the seeds of the episodes count up
     :raises TypeError: If the model has no actor-critic policy
     :raises ValueError: If it has no environments
     """
@@ -40,7 +40,8 @@ class CandidateUtility:
         self.model = model
         self.env = env_of(model)
         self.n_episodes = check_integer("n_episodes", n_episodes, 1)
-        self.seed = check_integer("seed", seed, 0)
+        # Were it the first seed, neighbouring seeds would share nearly all of their episodes
+        self.seed = int(np.random.default_rng(check_integer("seed", seed, 0)).integers(2**31))
         self.n_steps = 0
         #: A bar of tqdm that counts episodes, or None
         self.bar: Any = None

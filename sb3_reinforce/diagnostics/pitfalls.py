@@ -94,13 +94,17 @@ def rate_too_large(history: History) -> str | None:
 
 def unscaled_returns(history: History) -> str | None:
     """Returns in the thousands that nothing normalizes."""
+    model = history.model
     scale = history.updates[-1].return_scale
-    if scale > 1000 and not history.model.normalize_advantage:
-        return (
-            f"The returns have a root mean square of {scale:.3g}, and the gradient has their scale. Wrap the "
-            "environment in VecNormalize, or set normalize_advantage=True"
-        )
-    return None
+    is_natural = model.step == "natural"
+    if scale <= 1000 or model.normalize_advantage or (is_natural and not model.has_critic):
+        return None
+    # The natural step does not depend on the scale, but the critic's does
+    what, remedy = ("critic's gradient", "") if is_natural else ("gradient", ", or set normalize_advantage=True")
+    return (
+        f"The returns have a root mean square of {scale:.3g}, and the {what} has their scale. Wrap the environment in "
+        f"VecNormalize{remedy}"
+    )
 
 
 def too_few_episodes(history: History) -> str | None:

@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_reinforce.common.interruptions import interruptible
-from sb3_reinforce.common.processes import rank_and_size
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
 from sb3_reinforce.envs.starts import has_given_seeds, separate
@@ -34,9 +33,8 @@ def guarded(learn: Learn) -> Learn:
             try:
                 return learn(model, *args, **kwargs)
             except BadData as error:
-                step = (model.num_timesteps - model._num_timesteps_at_start) // (model.n_envs * rank_and_size()[1])
                 raise ValueError(
-                    f"{error} (step {step} since learn() began). The policy has not been updated with it."
+                    f"{error} (num_timesteps={model.num_timesteps}). The policy has not been updated with it."
                 ) from error
             finally:
                 forget_seeds(model)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
+from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Reset all copies with the pending seeds and options, which must be the same for all."""
-        if any(options != self._options[0] for options in self._options):
+        if not all(data_equivalence(options, self._options[0]) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
         obs, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
@@ -222,8 +223,8 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
 def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:
     """The info of copy ``i`` from Gymnasium's dict of arrays, in which ``_key`` masks ``key``."""
     info = {}
+    masks = {f"_{key}" for key in env_infos}
     for key, values in env_infos.items():
-        is_mask = key.startswith("_") and key[1:] in env_infos
-        if not is_mask and (f"_{key}" not in env_infos or env_infos[f"_{key}"][i]):
+        if key not in masks and (f"_{key}" not in env_infos or env_infos[f"_{key}"][i]):
             info[key] = info_of(values, i) if isinstance(values, dict) else values[i]
     return info

@@ -28,17 +28,27 @@ KEEP_REWARDS = {
 
 
 class ObservationStatistics:
-    """Statistics of the observations below a VecNormalize since it was frozen."""
+    """Statistics of the observations below a frozen VecNormalize, as long as it would learn."""
 
     def __init__(self, vec_normalize: VecNormalize):
         self.vec_normalize = vec_normalize
         self.totals = observation_moments(vec_normalize)
         # No observation counts here yet, not even the pseudo-observations with which a VecNormalize starts
         self.seen = {key: RunningMeanStd(0.0, total.mean.shape) for key, total in self.totals.items()}
+        self.freeze()
+
+    def freeze(self) -> None:
+        """Let the wrapper not learn."""
+        self.is_training = self.vec_normalize.training
+        self.vec_normalize.training = False
+
+    def thaw(self) -> None:
+        """Let the wrapper learn, unless a callback has set that it does not."""
+        self.vec_normalize.training = self.is_training
 
     def update(self) -> None:
         """Add the observations of the last step."""
-        if self.seen:
+        if self.is_training and self.seen:
             obs = self.vec_normalize.get_original_obs()
             for key, seen in self.seen.items():
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
@@ -68,18 +78,12 @@ def check_scale(env: VecEnv | None) -> None:
 def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
     """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""
     observed = [ObservationStatistics(each) for each in normalizers(env) if each.training]
-    set_training(observed, False)
     try:
         yield observed
     finally:
-        set_training(observed, True)
+        for each in observed:
+            each.thaw()
     for each in observed:
         for key, seen in each.seen.items():
             if seen.count:
                 each.totals[key].combine(seen)
-
-
-def set_training(observed: list[ObservationStatistics], is_training: bool) -> None:
-    """Let each VecNormalize learn, or not."""
-    for each in observed:
-        each.vec_normalize.training = is_training

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, columns_of, evaluate_candidates, seeds_of
-from sb3_reinforce.sampling.normalization import ObservationStatistics, set_training
+from sb3_reinforce.sampling.normalization import ObservationStatistics
 
 
 class Stopped(Exception):
@@ -76,11 +76,12 @@ class EpisodicUtility:
             finished = np.flatnonzero(step.finished)
             self.model._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
         self.callback.update_locals({"self": self.model, **vars(step)})
+        # A callback may save a wrapper, and must find it as the user has set it
         for each in self.observed:
             each.update()
-        # A callback may save a wrapper, and must find it as the user has set it
-        set_training(self.observed, True)
+            each.thaw()
         go_on = self.callback.on_step()
-        set_training(self.observed, False)
+        for each in self.observed:
+            each.freeze()
         if not go_on:
             raise Stopped

@@ -103,10 +103,10 @@ class Experiment(exp_manager.ExperimentManager):
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)
-        keywords = {
-            key: as_dict(key, found.get(key))
-            for key in ("policy_kwargs", "monitor_kwargs", "env_kwargs", "normalize", TRAIN_ENV_KWARGS)
-        }
+        keywords = {key: as_dict(key, found.get(key)) for key in (*PYTHON_KEYS, "env_kwargs", TRAIN_ENV_KWARGS)}
+        # Evaluations are in the entry's environment too, unless the command line names another
+        if self.eval_env_kwargs == self.env_kwargs:
+            self.eval_env_kwargs = {**keywords["env_kwargs"], **self.env_kwargs}
         for names in (*keywords.values(), *(names for _, _, names in classes_of(found))):
             self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))

@@ -62,7 +62,7 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
         n_episodes=n_episodes,
         name=name,
         seed=arguments["seed"],
-        settings=yaml.safe_dump(settings),
+        settings=yaml.dump(settings),
         std=std,
         timesteps=max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"]),
     )

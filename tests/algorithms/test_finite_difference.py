@@ -214,6 +214,12 @@ def test_vec_normalize_is_frozen_in_an_update_and_learns_between(norm_obs):
         assert env.obs_rms.count == count and not env.training
 
 
+def test_a_callback_may_stop_the_statistics_of_vec_normalize():
+    env = VecNormalize(make_vec_env("CartPole-v1", 2))
+    make(env).learn(60, At(3, lambda model: setattr(env, "training", False)))
+    assert not env.training and env.obs_rms.count == pytest.approx(2 + 2 * 3, abs=1e-3)
+
+
 def test_a_stopped_update_leaves_its_observations_in_the_statistics():
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     model = make(env).learn(1000, At(7))

@@ -99,6 +99,7 @@ def history(updates, progress, signal, kwargs):
 
 
 few = {"n_episodes": 4}
+large = {"return_scale": 2e3}
 spread = {"randomness": 1.0}
 peaked = {"randomness": 0.3}
 fixed = {"randomness": 0.01}
@@ -114,7 +115,8 @@ cut = {"n_steps": 32, "baseline": "mean"}
         ("rate_too_large", seen({"kl": 0.2}, n=10), seen({"kl": 0.2}, n=9)),
         ("rate_too_large", seen({}, {"kl": 1.5}), seen({"kl": 1.5}, {})),
         ("rate_too_large", seen(spread, *[peaked] * 9), seen(spread, *[peaked] * 10)),
-        ("unscaled_returns", seen({"return_scale": 2e3}), seen({"return_scale": 2e3}, normalize_advantage=True)),
+        ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
+        ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
         ("too_few_episodes", seen(few, n=50), seen(few, n=50, signal=0.3)),
         ("too_few_episodes", seen({"n_steps": 20}, n=50), seen({}, n=50)),
         ("too_few_episodes", seen(few, n=50), seen(few, n=49)),

@@ -52,6 +52,7 @@ class Dicts(gym.ObservationWrapper):
     def step(self, action):
         obs, reward, terminated, truncated, _ = super().step(action)
         infos = {"height": 3.5, "_own": 2, "goal": {"place": {"x": float(obs["obs"].sum()), "at": np.zeros(2)}}}
+        infos["visits"] = {0: 1.5}
         return obs, reward, terminated, truncated, infos | ({"last": True} if terminated else {})
 
     def reset(self, *, seed=None, options=None):
@@ -122,7 +123,9 @@ def test_every_transition_of_the_native_cart_pole_is_that_of_the_single_one():
 
 def test_options_must_be_the_same_for_all_copies():
     env = synced(Corridor)
-    env.set_options([{"level": i} for i in range(N_ENVS)])
+    env.set_options([{"level": np.zeros(2)} for _ in range(N_ENVS)])
+    env.reset()
+    env.set_options([{"level": np.full(2, i)} for i in range(N_ENVS)])
     with pytest.raises(ValueError, match="set_options"):
         env.reset()
 

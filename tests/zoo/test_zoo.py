@@ -62,6 +62,11 @@ def test_a_model_card_describes_the_last_agent(name, folder):
     assert yaml.safe_load(settings) == config_of(card.parent)
 
 
+def test_a_model_card_names_the_classes_of_the_settings(tmp_path):
+    train("reinforce", "-n", "64", "-f", str(tmp_path), "-params", "policy_kwargs:dict(activation_fn=nn.ReLU)")
+    assert "activation.ReLU" in write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
+
+
 @pytest.mark.parametrize("name", ["reinforce", "finite_difference"])
 def test_record_video_also_of_an_environment_of_another_package(name, tmp_path, monkeypatch):
     pytest.importorskip("pygame")

@@ -137,6 +137,13 @@ def test_train_env_kwargs_are_for_training_only(arguments, length, written, tmp_
     assert min(map(int, re.findall(r"Episode Length (\d+)", capsys.readouterr().out))) > 5
 
 
+@pytest.mark.parametrize(("arguments", "length"), [((), 5), (("--eval-env-kwargs", "max_episode_steps:6"), 6)])
+def test_evaluations_have_the_env_kwargs_of_an_entry_or_their_own(arguments, length, tmp_path):
+    entry = {"policy": "MlpPolicy", "n_timesteps": 64, "n_steps": 32, "env_kwargs": {"max_episode_steps": 5}}
+    train("reinforce", *conf(tmp_path, **{"CartPole-v1": entry}), "--eval-freq", "32", *arguments)
+    assert set(np.load(tmp_path / "reinforce" / RUN / "evaluations.npz")["ep_lengths"].flat) == {length}
+
+
 def test_an_entry_goes_before_the_section_of_train_env_kwargs(tmp_path):
     entry = {"policy": "MlpPolicy", "n_timesteps": 64, "train_env_kwargs": {"max_episode_steps": 6}}
     section = {"CartPole-v1": {"max_episode_steps": 5}}
