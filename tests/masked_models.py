@@ -19,14 +19,8 @@ ALGORITHMS = {
     "ppo": (PPO, {"n_steps": 64, "batch_size": 64, "n_epochs": 2}),
     "recurrent": (RecurrentREINFORCE, {"n_steps": 16}),
 }
-
-
 VECTOR = spaces.Box(-1, 1, (3,))
-
-
 IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
-
-
 TASKS = {
     "discrete": (VECTOR, spaces.Discrete(5)),
     "multidiscrete": (VECTOR, spaces.MultiDiscrete([2, 4, 3])),

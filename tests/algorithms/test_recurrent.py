@@ -26,12 +26,8 @@ from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 GAMMA = 0.5
-
-
 # float32 holds them exactly
 REWARDS = np.random.default_rng(0).integers(-8, 8, (2, 2, 2)) / 4
-
-
 FIRST_REWARDS = np.random.default_rng(1).integers(-8, 8, (2, 2)) / 4
 
 

@@ -34,8 +34,6 @@ def predict(*arguments):
 
 
 THREE = np.zeros((3, 4), dtype=np.float32)
-
-
 TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
 
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At, Record
+from callbacks import Record
 from models import KINDS, both, make, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -22,14 +22,8 @@ from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARG
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
 
 NAN, INF = float("nan"), float("inf")
-
-
 TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
-
-
 NO_NUMBERS = ["x", True, [1], 1j, None]
-
-
 WRONG = {
     "check_number": [*NO_NUMBERS, NAN, INF, -INF],
     "CheckedSchedule": [*NO_NUMBERS, -1, NAN, INF, lambda p: NAN, lambda p: -1.0, lambda p: "x", lambda p: np.ones(2)],
@@ -232,47 +226,6 @@ def test_the_search_recommends_the_cpu(policy):
 def test_the_message_says_what_is_allowed(check, wrong, allowed):
     with pytest.raises((TypeError, ValueError), match=f"^x must be {allowed}, got {wrong!r}"):
         check("x", wrong)
-
-
-@both
-@pytest.mark.parametrize("form", [float, np.float32, np.array, lambda rate: np.array([rate]), th.tensor])
-def test_forms_that_stand_for_the_value_of_a_schedule(form, kind):
-    model = make(kind, learning_rate=lambda progress: form(1e-3), seed=2**32 - 1).learn(8)
-    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
-
-
-@pytest.mark.parametrize(("kind", "name"), [("steps", "temperature"), ("search", "delta_std")])
-def test_a_schedule_may_fall_to_an_excluded_bound_but_not_start_there(kind, name):
-    for schedule in (lambda progress: 0.0, lambda progress: 1 - progress):
-        with pytest.raises(ValueError, match=rf"{name} \(at progress 1\) must be (in \(0|finite and > 0)"):
-            make(kind, **{name: schedule})
-    with pytest.raises(ValueError, match=rf"{name} \(at progress 0\) must be (in \[0|finite and >= 0)"):
-        make(kind, **{name: lambda progress: 2 * progress - 1})
-    make(kind, **{name: lambda progress: progress}).learn(8)
-
-
-def test_a_schedule_that_goes_wrong_later_stops_training_before_a_step():
-    model = make("steps", learning_rate=lambda progress: NAN if 0 < progress < 0.6 else 1e-3)
-    with pytest.raises(ValueError, match="learning_rate"):
-        model.learn(16)
-    assert model._n_updates == 0
-
-
-def test_a_schedule_is_called_once_where_its_value_is_needed_once():
-    seen = []
-    model = make("steps", ent_coef=lambda progress: seen.append(progress) or 0.0)
-    n_before = len(seen)
-    model.learn(80)
-    assert len(seen) - n_before == model._n_updates == 10
-    # Before Stable-Baselines3 has the argument, and when the model keeps it, both at both ends
-    assert seen[:n_before] == [1.0, 0.0] * 2
-
-
-@both
-def test_a_callback_may_replace_a_schedule(kind):
-    name = "ent_coef" if kind == "steps" else "delta_std"
-    with pytest.raises(TypeError, match=f"{name} must be a number or a schedule"):
-        make(kind, **{name: 0.1}).learn(1000, At(1, lambda model: setattr(model, name, "x")))
 
 
 @both

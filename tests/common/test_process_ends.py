@@ -49,11 +49,7 @@ def named(rank, error):
 
 
 DEAD = ProcessError("Process 1 of 2 has died, or ended without a message")
-
-
 INTERRUPTED = "KeyboardInterrupt"
-
-
 # What happens in which process, the errors of both, and with which kinds of updates
 STOPS = {
     "callback returns False": (0, "callback", lambda model: False, (None, None), KINDS),

@@ -52,14 +52,8 @@ def test_finite_difference_has_the_same_parameters_bit_for_bit(n_updates, names,
 
 
 EXTENTS = {"steps": {"n_steps": 12}, "episodes": {"n_steps": None, "n_episodes": 7}}
-
-
 MEMORY = {"baseline": "value", "policy_kwargs": {"lstm_hidden_size": 4, "net_arch": [4]}}
-
-
 SHARED_EXTRACTOR = {"net_arch": [4], "features_extractor_class": Scaled}
-
-
 ROLLOUTS = {f"{name} {extent}": {"baseline": name, **EXTENTS[extent]} for name in BASELINES for extent in EXTENTS} | {
     "shared extractor": {"policy_kwargs": SHARED_EXTRACTOR},
     "total return": {"baseline": "mean", "reward_to_go": False, **EXTENTS["steps"]},
@@ -69,8 +63,6 @@ ROLLOUTS = {f"{name} {extent}": {"baseline": name, **EXTENTS[extent]} for name i
     "recurrent episodes": {"n_episodes": 7, **MEMORY},
     "recurrent steps": {"n_steps": 5, **MEMORY},
 }
-
-
 WRAPPERS = {"normalized": VecNormalize, "schedules": VecNormalize}
 
 

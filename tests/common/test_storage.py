@@ -24,8 +24,6 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_reinforce import REINFORCE, FiniteDifference
 
 FULL = OSError(28, "No space left on device")
-
-
 SAVES = {
     "str": lambda model, folder: model.save(str(folder / "best_model")),
     "Path": lambda model, folder: model.save(folder / "best_model"),

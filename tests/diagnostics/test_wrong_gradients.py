@@ -30,16 +30,10 @@ def altered(log_prob=lambda log_prob, actions: log_prob, actions=lambda actions:
 
 # As if for a loss
 NEGATED = altered(lambda log_prob, actions: -log_prob)
-
-
 # The next action instead of the one that was taken
 SHIFTED = altered(actions=lambda actions: (actions + 1) % 3)
-
-
 # A constant per action, with which log π no longer is a log-probability
 OFFSET = altered(lambda log_prob, actions: log_prob + 0.1 * actions)
-
-
 DETACHED = altered(lambda log_prob, actions: log_prob.detach())
 
 

@@ -16,8 +16,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 NAN, INF = float("nan"), float("inf")
-
-
 bare_or_normalized = pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 
 
@@ -49,8 +47,6 @@ class Recording(VecNormalize):
 
 
 WIDE = spaces.Box(-INF, INF, (7,), np.float64)
-
-
 NOT_FINITE = {
     "reward nan": dict(fault="reward", at=20, value=NAN),
     "reward -inf": dict(fault="reward", at=20, value=-INF),
@@ -64,8 +60,6 @@ NOT_FINITE = {
     "reward below float32": dict(fault="reward", at=20, value=-1e60),
     "observation below float32": dict(fault="observation", at=20, value=np.full(7, -1e200), observation_space=WIDE),
 }
-
-
 WRAPPERS = {
     "bare": lambda env: env,
     "normalized": Recording,

@@ -23,8 +23,6 @@ MALFORMED = {
     "objects": np.array([None] * 7),
     "ragged": [[0.0], [0.0, 1.0]],
 }
-
-
 # Where the second environment returns it, and in which step of all of them
 WHEN = {
     "step": (dict(fault="observation", at=5), 4),

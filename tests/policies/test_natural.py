@@ -152,11 +152,7 @@ def sums(action_space):
 
 
 BOX = spaces.Box(-1, 1, (2,))
-
-
 MASKED = InvalidActionEnvMultiDiscrete([3, 4], n_invalid_actions=3)
-
-
 MODELS = {
     "Discrete": ("MlpPolicy", sums(spaces.Discrete(3, start=1)), {}),
     "MultiDiscrete": ("MlpPolicy", sums(spaces.MultiDiscrete([2, 3])), {}),
