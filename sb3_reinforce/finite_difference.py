@@ -57,8 +57,9 @@ class FiniteDifference(BasePolicyGradient):
         ``regression: [1 Δ] [u₀ ĝ]ᵀ ≈ U(θ+Δ)``
 
     (Peters and Schaal, 2008, section 3.1). No derivative of the policy is used, and returns are undiscounted. θ is the
-    actor's parameters; the critic and ``log_std`` are not searched. Different candidates act in different environments
-    of one VecEnv: plain MLPs in one batched forward pass, other policies one after the other.
+    actor's parameters, those that log π of an observation near 0 depends on; the critic and ``log_std`` are not
+    searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward pass,
+    other policies one after the other.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
     the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it. If a

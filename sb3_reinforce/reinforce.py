@@ -36,13 +36,14 @@ from sb3_reinforce.policies.evaluation import (
     Parameters,
     Route,
     acting_log_prob,
+    actor_parameters,
+    critic_parameters,
     evaluate,
     floor_std,
     route_of,
     sampled_divergence,
     set_temperature,
     some_steps,
-    split_parameters,
     trainable,
 )
 from sb3_reinforce.policies.masks import MaskedPolicy
@@ -260,7 +261,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         optimization.fuse(self.policy.optimizer)
         self._make_critic_optimizer()
         self._present_parameters: tuple[tuple[int, bool], ...] = ()
-        self._parameter_groups: tuple[Parameters, Parameters, Parameters] = ([], [], [])
+        self._reached: tuple[set[th.nn.Parameter], set[th.nn.Parameter]] = (set(), set())
         self._apply_temperature_and_floor()
 
     def _make_critic_optimizer(self) -> None:
@@ -273,18 +274,30 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         optimization.fuse(self.critic_optimizer)
 
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
-        """What log π depends on, what only V depends on, and what both do; sorted again if the policy has changed."""
+        """
+        What log π depends on, what only V depends on, and what both do (a shared features extractor).
+
+        They are read from the graph and not from their names, also of earlier rollouts: a network may use a part of
+        itself in each.
+        """
+        parameters = trainable(self.policy)
         if rollout.values is None:
-            return trainable(self.policy), [], []
+            return parameters, [], []
         present = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
         if self._present_parameters != present:
             held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
             if not held >= {number for number, _ in present}:
                 self._make_critic_optimizer()
-            self.policy.set_training_mode(False)
-            self._parameter_groups = split_parameters(self.policy, batch.observations, batch.actions)
             self._present_parameters = present
-        return self._parameter_groups
+            self._reached = set(), set()
+        of_actor, of_critic = self._reached
+        if not of_actor | of_critic >= set(parameters):
+            self.policy.set_training_mode(False)
+            of_actor.update(actor_parameters(self.policy, batch.observations, batch.actions))
+            of_critic.update(critic_parameters(self.policy, batch.observations, batch.actions))
+        only_critic, both = of_critic - of_actor, of_critic & of_actor
+        actor, critic, shared = ([p for p in parameters if p in group] for group in (of_actor, only_critic, both))
+        return actor, critic, shared
 
     def _apply_temperature_and_floor(self) -> None:
         set_temperature(self.policy, self._scheduled("temperature"))
@@ -330,6 +343,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             extent = Extent.whole_episodes(n_episodes, env.num_envs, self.max_episode_steps)
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
+        baseline = self._function("baseline", BASELINES)
         route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
         is_collected = False
@@ -344,7 +358,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             own = Columns(all_dones, terminal_obs, self._last_obs, extent.quota, self._state)
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
-                self.rollout = self._complete(rollout_buffer, columns, route, is_fixed=n_rollout_steps is not None)
+                self.rollout = self._complete(rollout_buffer, columns, route, baseline, n_rollout_steps is not None)
             is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
@@ -379,7 +393,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             return
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
-    def _complete(self, buffer: RolloutBuffer, columns: Columns, route: Route, is_fixed: bool) -> Rollout:
+    def _complete(
+        self, buffer: RolloutBuffer, columns: Columns, route: Route, baseline: Baseline, is_fixed: bool
+    ) -> Rollout:
         """The rollout with the weights of its steps, which the buffer gets too."""
         self._running = self._running.unless(buffer.episode_starts[0].astype(bool))
         next_values = None
@@ -393,7 +409,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self._running,
             next_values,
             columns.state,
-            baseline=self._function("baseline", BASELINES),
+            baseline=baseline,
             gamma=self.gamma,
             gae_lambda=self.gae_lambda,
             reward_to_go=self.reward_to_go,
@@ -552,7 +568,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["_present_parameters", "_parameter_groups", "rollout", "is_collecting"]
+        own = ["_present_parameters", "_reached", "rollout", "is_collecting"]
         return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -83,6 +83,23 @@ def float64() -> Iterator[None]:
         th.set_default_dtype(th.float32)
 
 
+class Experts(FlattenExtractor):
+    """A network for each step of a Corridor, which sees its own rows only."""
+
+    def __init__(self, space: spaces.Space[Any]):
+        super().__init__(space)
+        self.experts = th.nn.ModuleList(th.nn.Linear(self.features_dim, self.features_dim) for _ in range(2))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        features = super().forward(observations)
+        outputs = th.zeros_like(features)
+        for t, expert in enumerate(self.experts):
+            rows = features[:, t] == 1
+            if rows.any():
+                outputs[rows] = expert(features[rows])
+        return outputs
+
+
 class Scaled(FlattenExtractor):
     """A user's features extractor with a parameter, which a policy that shares it knows by three names."""
 

@@ -164,25 +164,15 @@ def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple
 def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
     """log π(a|s) of the policy that acts, which is in evaluation mode."""
     # A user's evaluate_actions may differentiate
-    with th.set_grad_enabled(route.evaluate_actions):
+    with th.set_grad_enabled(overrides(policy, "evaluate_actions")):
         return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
 
 
-def split_parameters(
-    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
-) -> tuple[Parameters, Parameters, Parameters]:
-    """
-    The trainable parameters that log π depends on, those that only V depends on, and those that both depend on.
-
-    They are read from the graph and not from their names. The third list (a shared features extractor) is part of the
-    first.
-    """
-    actor = actor_parameters(policy, obs, actions)
+def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
+    """The trainable parameters that V depends on, in the policy's order."""
     route = route_of(policy, with_critic=True)
     values = evaluate(policy, route, obs, actions, with_values=True)[2]
-    critic = reached_by(cast(th.Tensor, values), trainable(policy))
-    in_actor = set(actor)
-    return actor, [p for p in critic if p not in in_actor], [p for p in critic if p in in_actor]
+    return reached_by(cast(th.Tensor, values), trainable(policy))
 
 
 def trainable(policy: ActorCriticPolicy) -> Parameters:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from gymnasium.vector.utils import create_empty_array
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -19,8 +20,7 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     # The memory of this package's recurrent policies and of sb3-contrib's
     if hasattr(policy, "lstm_actor"):
         raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
-    zero_obs: Any = create_empty_array(policy.observation_space)
-    obs = obs_as_tensor(zero_obs, policy.device)
+    obs = obs_as_tensor(observation_in(policy.observation_space), policy.device)
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
     training = policy.training
@@ -40,6 +40,14 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"
         )
     return searched
+
+
+def observation_in(space: spaces.Space[Any]) -> Any:
+    """One observation, as near to 0 as its space allows, since a features extractor may be undefined elsewhere."""
+    if isinstance(space, spaces.Dict):
+        return {key: observation_in(part) for key, part in space.spaces.items()}
+    zeros: Any = create_empty_array(space)
+    return zeros.clip(space.low, space.high) if isinstance(space, spaces.Box) else zeros
 
 
 def read(parameters: Sequence[th.Tensor]) -> th.Tensor:

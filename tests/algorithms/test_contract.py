@@ -12,7 +12,7 @@ import torch as th
 from callbacks import Record
 from environments import Corridor, Random, Reused
 from gymnasium import spaces
-from models import KINDS, all_kinds, make, moved_by_learning
+from models import KINDS, Scaled, all_kinds, make, moved_by_learning
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -191,6 +191,7 @@ def test_rollout_buffer_classes():
 
 
 def test_the_policy_can_be_pickled_and_copied():
-    policy = make("steps", temperature=0.5).policy
+    kwargs = {"net_arch": [4], "features_extractor_class": Scaled}
+    policy = make("steps", temperature=0.5, policy_kwargs=kwargs).learn(16).policy
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert all(map(th.equal, policy.parameters(), other.parameters()))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
+from environments import Random
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
 from models import OwnPrediction, Scaled, plain
 from searches import Line, make
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
@@ -77,6 +78,17 @@ def test_a_features_extractor_of_the_user_is_searched_and_left_as_it_was():
         assert plain(model.policy.state_dict()) == before
     model.policy.features_extractor.requires_grad_(False)
     assert model.n_parameters == n_parameters - 1
+
+
+class Log(FlattenExtractor):
+    """Is not defined at 0."""
+
+    def forward(self, observations):
+        return super().forward(observations).log()
+
+
+def test_a_features_extractor_is_asked_within_the_space():
+    make(Random(spaces.Box(0.5, 2, (3,))), "MlpPolicy", policy_kwargs={"features_extractor_class": Log}).learn(10)
 
 
 def test_what_a_callback_freezes_is_searched_for_the_last_time():

@@ -2,10 +2,10 @@
 
 import pytest
 import torch as th
-from callbacks import Record
+from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
-from models import all_kinds, make, moved_by_learning, plain
+from models import Experts, all_kinds, make, moved_by_learning, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -34,6 +34,23 @@ def test_the_current_rollout_is_trained_on_with_the_arguments_it_was_collected_w
         ends.append(model.policy.state_dict())
     assert plain(ends[0]) == plain(ends[1])
     assert ("value_net.weight" in moved_by_learning(model, 1)) == ("baseline" in change)
+
+
+@pytest.mark.parametrize("step", ["optimizer", "natural"])
+@pytest.mark.parametrize("share", [True, False])
+def test_a_network_may_use_a_part_of_itself_in_each_rollout(share, step):
+    kwargs = {"net_arch": [4], "features_extractor_class": Experts, "share_features_extractor": share}
+    env = Corridor((2,), lambda t, action: float(action) + t)
+    model = make("steps", env, n_steps=1, step=step, seed=0, policy_kwargs=kwargs)
+    experts = {name for name, _ in model.policy.named_parameters() if "experts" in name}
+    assert experts and experts <= moved_by_learning(model, 16)
+
+
+def test_a_baseline_that_is_set_within_a_rollout_counts_from_the_next_one():
+    critics = Record(lambda model: model.rollout.values is not None)
+    change = At(2, lambda model: setattr(model, "baseline", "value"))
+    make("episodes", Corridor((4,)), n_episodes=1).learn(12, [change, critics])
+    assert critics.records == [False, True, True]
 
 
 def test_a_critic_warms_up_while_the_actor_is_frozen():

@@ -146,6 +146,12 @@ def test_candidates_share_their_starts_and_calls_do_not():
     assert th.equal(pairs[0], pairs[1]) and len(pairs[0].unique()) == 2
 
 
+def test_neighbouring_seeds_share_no_episodes():
+    model = REINFORCE("MlpPolicy", Corridor(), device="cpu")
+    first, second = (CandidateUtility(model, 1, seed=seed).seed for seed in (0, 1))
+    assert abs(first - second) > 10**6
+
+
 @pytest.mark.parametrize("shape", [(8,), (8, 1), (0, 8), (1, 1, 2, 8)])
 def test_candidates_of_another_shape_are_named_before_they_play(shape):
     model = REINFORCE("MlpPolicy", Corridor((2, 9)), policy_kwargs={"net_arch": []}, device="cpu").learn(4)
