@@ -36,10 +36,9 @@ from sb3_reinforce.policies.evaluation import (
     Parameters,
     Route,
     acting_log_prob,
-    actor_parameters,
-    critic_parameters,
     evaluate,
     floor_std,
+    reached_parameters,
     route_of,
     sampled_divergence,
     set_temperature,
@@ -277,8 +276,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         What log π depends on, what only V depends on, and what both do (a shared features extractor).
 
-        They are read from the graph and not from their names, also of earlier rollouts: a network may use a part of
-        itself in each.
+        They are read from the graphs of this and earlier rollouts, not from their names, until each parameter has been
+        reached: a network may use a part of itself in each rollout.
         """
         parameters = trainable(self.policy)
         if rollout.values is None:
@@ -293,8 +292,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         of_actor, of_critic = self._reached
         if not of_actor | of_critic >= set(parameters):
             self.policy.set_training_mode(False)
-            of_actor.update(actor_parameters(self.policy, batch.observations, batch.actions))
-            of_critic.update(critic_parameters(self.policy, batch.observations, batch.actions))
+            found = reached_parameters(self.policy, batch.observations, batch.actions)
+            of_actor.update(found[0])
+            of_critic.update(found[1])
         only_critic, both = of_critic - of_actor, of_critic & of_actor
         actor, critic, shared = ([p for p in parameters if p in group] for group in (of_actor, only_critic, both))
         return actor, critic, shared

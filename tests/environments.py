@@ -207,7 +207,7 @@ class Reused(Wrapper):
         return obs, rewards, self.dones, infos
 
 
-def of_two(**fault):
+def of_two(**fault: Any) -> DummyVecEnv:
     """Two environments, of which the second has the fault."""
     both = {"observation_space": fault.get("observation_space"), "truncate": fault.get("truncate", False)}
     return DummyVecEnv([lambda: Faulty(**both), lambda: Faulty(**fault)])

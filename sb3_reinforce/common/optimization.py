@@ -19,6 +19,8 @@ def step(
     name: str,
 ) -> float:
     """Clip the gradients of a loss to a common norm, descend along them, and return the norm before clipping."""
+    if all(gradient is None for gradient in gradients):
+        return 0.0
     norm = finite_norm(to_vector(gradients), name, REMEDY)
     scale = 1.0 if max_grad_norm is None else min(1.0, max_grad_norm / (norm + 1e-6))
     optimizer.zero_grad()

@@ -29,7 +29,7 @@ class CandidateUtility:
 
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility
-    :param seed: Seed of the random number from which the seeds of the episodes count up
+    :param seed: Seed of the episodes
     :raises TypeError: If the model has no actor-critic policy
     :raises ValueError: If it has no environments
     """

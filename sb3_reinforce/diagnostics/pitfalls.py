@@ -96,10 +96,11 @@ def unscaled_returns(history: History) -> str | None:
     """Returns in the thousands that nothing normalizes."""
     model = history.model
     scale = history.updates[-1].return_scale
-    is_natural = model.step == "natural"
-    if scale <= 1000 or model.normalize_advantage or (is_natural and not model.has_critic):
-        return None
     # The natural step does not depend on the scale, but the critic's does
+    is_natural = model.step == "natural"
+    is_scaled = not model.has_critic if is_natural else model.normalize_advantage
+    if scale <= 1000 or is_scaled:
+        return None
     what, remedy = ("critic's gradient", "") if is_natural else ("gradient", ", or set normalize_advantage=True")
     return (
         f"The returns have a root mean square of {scale:.3g}, and the {what} has their scale. Wrap the environment in "

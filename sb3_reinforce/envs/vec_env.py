@@ -50,9 +50,10 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Reset all copies with the pending seeds and options, which must be the same for all."""
-        if not all(data_equivalence(options, self._options[0]) for options in self._options):
+        first = self._options[0]
+        if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
-        obs, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()

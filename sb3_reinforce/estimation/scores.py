@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_reinforce.common.tensors import select, take, to_vector
+from sb3_reinforce.common.spaces import as_policy_actions
+from sb3_reinforce.common.tensors import flatten, select, take, to_vector
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.policies.evaluation import (
     Parameters,
@@ -43,7 +44,8 @@ def gradients_by_episode(
     """
     ``Σ_t w_t ∇θ log π(a_t|s_t)`` over the used steps of each episode, for each of k weights.
 
-    θ are the trainable parameters that log π depends on, in the order of ``policy.parameters()``.
+    θ are the trainable parameters that log π of the rollout's first step depends on, in the order of
+    ``policy.parameters()``.
 
     :param rollout: The rollout, with m episodes that have used steps
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``
@@ -128,12 +130,10 @@ def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
 
 def parameters_of(rollout: Rollout) -> Parameters:
-    """``score_parameters`` of the policy that made a rollout, which may use only a part of itself at each step."""
-    obs, actions = used_inputs(rollout)
-    if factored_layers(rollout.policy) is not None:
-        first = th.arange(1)
-        obs, actions = take(obs, first), actions[first]
-    return score_parameters(rollout.policy, obs, actions)
+    """``score_parameters`` of the policy that made a rollout, from its first step."""
+    first = th.arange(1)
+    actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
+    return score_parameters(rollout.policy, take(flatten(rollout.inputs), first), actions)
 
 
 def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:

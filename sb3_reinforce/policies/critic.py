@@ -98,8 +98,10 @@ def fit_critic(
                 values = value(batch).flatten()
                 # A GPU does not differentiate the error between float64 and float32
                 loss = F.mse_loss(values, returns[batch].to(values))
-                gradients = th.autograd.grad(loss, parameters, allow_unused=True)
-                optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
+                # A network may use a part of itself in each batch
+                if loss.requires_grad:
+                    gradients = th.autograd.grad(loss, parameters, allow_unused=True)
+                    optimization.step(optimizer, parameters, gradients, max_grad_norm, "critic")
                 losses.append(loss.detach())
     return float(th.stack(losses).mean())
 

@@ -168,11 +168,16 @@ def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: 
         return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
 
 
-def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
-    """The trainable parameters that V depends on, in the policy's order."""
+def reached_parameters(
+    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
+) -> tuple[set[th.nn.Parameter], set[th.nn.Parameter]]:
+    """The trainable parameters that log π depends on, with all of a shared features extractor, and those V does."""
+    actor = set(actor_parameters(policy, obs, actions))
+    if policy.share_features_extractor:
+        actor.update(policy.features_extractor.parameters())
     route = route_of(policy, with_critic=True)
     values = evaluate(policy, route, obs, actions, with_values=True)[2]
-    return reached_by(cast(th.Tensor, values), trainable(policy))
+    return actor, set(reached_by(cast(th.Tensor, values), trainable(policy)))
 
 
 def trainable(policy: ActorCriticPolicy) -> Parameters:

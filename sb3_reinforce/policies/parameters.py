@@ -43,7 +43,7 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
 
 
 def observation_in(space: spaces.Space[Any]) -> Any:
-    """One observation, as near to 0 as its space allows, since a features extractor may be undefined elsewhere."""
+    """One observation, as near to 0 as its space allows, since a features extractor may be undefined outside it."""
     if isinstance(space, spaces.Dict):
         return {key: observation_in(part) for key, part in space.spaces.items()}
     zeros: Any = create_empty_array(space)

@@ -35,10 +35,10 @@ class ObservationStatistics:
         self.totals = observation_moments(vec_normalize)
         # No observation counts here yet, not even the pseudo-observations with which a VecNormalize starts
         self.seen = {key: RunningMeanStd(0.0, total.mean.shape) for key, total in self.totals.items()}
-        self.freeze()
+        self.is_training = True
 
     def freeze(self) -> None:
-        """Let the wrapper not learn."""
+        """Stop the wrapper's learning."""
         self.is_training = self.vec_normalize.training
         self.vec_normalize.training = False
 
@@ -79,6 +79,8 @@ def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
     """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""
     observed = [ObservationStatistics(each) for each in normalizers(env) if each.training]
     try:
+        for each in observed:
+            each.freeze()
         yield observed
     finally:
         for each in observed:

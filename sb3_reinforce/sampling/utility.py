@@ -80,8 +80,10 @@ class EpisodicUtility:
         for each in self.observed:
             each.update()
             each.thaw()
-        go_on = self.callback.on_step()
-        for each in self.observed:
-            each.freeze()
+        try:
+            go_on = self.callback.on_step()
+        finally:
+            for each in self.observed:
+                each.freeze()
         if not go_on:
             raise Stopped

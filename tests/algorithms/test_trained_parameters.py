@@ -46,6 +46,41 @@ def test_a_network_may_use_a_part_of_itself_in_each_rollout(share, step):
     assert experts and experts <= moved_by_learning(model, 16)
 
 
+class CriticOfAll(ActorCriticPolicy):
+    """V depends on all experts at each step."""
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values + self.sum_of_all(), log_prob, entropy
+
+    def predict_values(self, obs):
+        return super().predict_values(obs) + self.sum_of_all()
+
+    def sum_of_all(self):
+        return sum(parameter.sum() for parameter in self.features_extractor.parameters())
+
+
+def test_the_critics_passes_leave_a_shared_extractor_alone_whatever_part_the_actor_uses():
+    kwargs = {"net_arch": [4], "features_extractor_class": Experts}
+    rates = {"learning_rate": 0.0, "critic_learning_rate": 0.1}
+    model = make("steps", Corridor((2,)), CriticOfAll, n_steps=1, seed=0, policy_kwargs=kwargs, **rates)
+    moved = moved_by_learning(model, 8)
+    assert moved and all("value_net" in name for name in moved)
+
+
+def test_a_batch_may_use_no_trained_parameter():
+    """Those of the other expert are all that is trained."""
+    kwargs = {"net_arch": [], "features_extractor_class": Experts, "share_features_extractor": False}
+    model = make("steps", Corridor((2,), lambda t, action: float(action)), n_steps=1, seed=0, policy_kwargs=kwargs)
+    model.policy.requires_grad_(False)
+    for extractor in (model.policy.pi_features_extractor, model.policy.vf_features_extractor):
+        extractor.experts[0].requires_grad_(True)
+    assert {name.split(".")[0] for name in moved_by_learning(model, 8)} == {
+        "features_extractor",
+        "vf_features_extractor",
+    }
+
+
 def test_a_baseline_that_is_set_within_a_rollout_counts_from_the_next_one():
     critics = Record(lambda model: model.rollout.values is not None)
     change = At(2, lambda model: setattr(model, "baseline", "value"))

@@ -1,4 +1,4 @@
-"""W processes of n environments are one process with W·n: the same parameters, steps, logs, and ends."""
+"""W processes of n environments are one process with W·n: the same parameters, steps and logs."""
 
 from functools import partial
 

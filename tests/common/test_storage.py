@@ -1,4 +1,4 @@
-"""A model is saved whole or not at all, a damaged file is named, and parameters are taken all or none."""
+"""A model is saved whole or not at all, a damaged file is named."""
 
 import io
 import os

@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from environments import Corridor
 from gymnasium import spaces
-from models import Experts
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -92,7 +91,6 @@ POLICIES = {
     "images": lambda: collect(FakeImageEnv(**IMAGES), "CnnPolicy", n_episodes=2),
     "dicts": lambda: collect(SimpleMultiObsEnv(random_start=False), "MultiInputPolicy", n_episodes=2),
     "one standard deviation": lambda: collect(Corridor((2, 9), action_space=BOX), OneStd),
-    "parts": lambda: collect(Corridor((2,)), policy_kwargs={"features_extractor_class": Experts}),
     "a method that branches": lambda: collect(Corridor((2, 9)), Branching),
 }
 
