@@ -75,10 +75,8 @@ def test_a_batch_may_use_no_trained_parameter():
     model.policy.requires_grad_(False)
     for extractor in (model.policy.pi_features_extractor, model.policy.vf_features_extractor):
         extractor.experts[0].requires_grad_(True)
-    assert {name.split(".")[0] for name in moved_by_learning(model, 8)} == {
-        "features_extractor",
-        "vf_features_extractor",
-    }
+    parts = {name.split(".")[0] for name in moved_by_learning(model, 8)}
+    assert parts == {"features_extractor", "vf_features_extractor"}
 
 
 def test_a_baseline_that_is_set_within_a_rollout_counts_from_the_next_one():

@@ -1,4 +1,4 @@
-"""Each argument is checked at construction, by load, by set_env and by learn; the error names it."""
+"""Each argument is checked at construction and by learn; the error names it."""
 
 from contextlib import suppress
 from copy import deepcopy

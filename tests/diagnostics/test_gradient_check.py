@@ -1,4 +1,4 @@
-"""The gradient check passes where the gradient is right, and names the line where it is wrong."""
+"""The gradient check passes where the gradient is right."""
 
 from functools import partial
 
