@@ -38,13 +38,13 @@ from sb3_reinforce.policies.evaluation import (
     acting_log_prob,
     evaluate,
     floor_std,
-    reached_parameters,
     route_of,
     sampled_divergence,
     set_temperature,
     some_steps,
     trainable,
 )
+from sb3_reinforce.policies.groups import ParameterGroups
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.sampling.actors import Actor, make_actor
@@ -259,8 +259,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         warn_of_own_methods(self.rollout_buffer)
         optimization.fuse(self.policy.optimizer)
         self._make_critic_optimizer()
-        self._present_parameters: tuple[tuple[int, bool], ...] = ()
-        self._reached: tuple[set[th.nn.Parameter], set[th.nn.Parameter]] = (set(), set())
+        self._groups = ParameterGroups()
         self._apply_temperature_and_floor()
 
     def _make_critic_optimizer(self) -> None:
@@ -273,31 +272,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         optimization.fuse(self.critic_optimizer)
 
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
-        """
-        What log π depends on, what only V depends on, and what both do (a shared features extractor).
-
-        They are read from the graphs of this and earlier rollouts, not from their names, until each parameter has been
-        reached: a network may use a part of itself in each rollout.
-        """
-        parameters = trainable(self.policy)
+        """What the actor trains, the critic alone and both; without a critic everything is the actor's."""
         if rollout.values is None:
-            return parameters, [], []
-        present = tuple((id(parameter), parameter.requires_grad) for parameter in self.policy.parameters())
-        if self._present_parameters != present:
-            held = {id(p) for group in self.critic_optimizer.param_groups for p in group["params"]}
-            if not held >= {number for number, _ in present}:
-                self._make_critic_optimizer()
-            self._present_parameters = present
-            self._reached = set(), set()
-        of_actor, of_critic = self._reached
-        if not of_actor | of_critic >= set(parameters):
-            self.policy.set_training_mode(False)
-            found = reached_parameters(self.policy, batch.observations, batch.actions)
-            of_actor.update(found[0])
-            of_critic.update(found[1])
-        only_critic, both = of_critic - of_actor, of_critic & of_actor
-        actor, critic, shared = ([p for p in parameters if p in group] for group in (of_actor, only_critic, both))
-        return actor, critic, shared
+            return trainable(self.policy), [], []
+        held = {parameter for group in self.critic_optimizer.param_groups for parameter in group["params"]}
+        if not held.issuperset(self.policy.parameters()):
+            self._make_critic_optimizer()
+        return self._groups.sort(self.policy, batch.observations, batch.actions)
 
     def _apply_temperature_and_floor(self) -> None:
         set_temperature(self.policy, self._scheduled("temperature"))
@@ -568,7 +549,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["_present_parameters", "_reached", "rollout", "is_collecting"]
+        own = ["_groups", "rollout", "is_collecting"]
         return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

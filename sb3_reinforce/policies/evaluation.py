@@ -168,18 +168,6 @@ def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: 
         return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
 
 
-def reached_parameters(
-    policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
-) -> tuple[set[th.nn.Parameter], set[th.nn.Parameter]]:
-    """The trainable parameters that log π depends on, with all of a shared features extractor, and those V does."""
-    actor = set(actor_parameters(policy, obs, actions))
-    if policy.share_features_extractor:
-        actor.update(policy.features_extractor.parameters())
-    route = route_of(policy, with_critic=True)
-    values = evaluate(policy, route, obs, actions, with_values=True)[2]
-    return actor, set(reached_by(cast(th.Tensor, values), trainable(policy)))
-
-
 def trainable(policy: ActorCriticPolicy) -> Parameters:
     """The parameters that are trained, in the policy's order."""
     return [parameter for parameter in policy.parameters() if parameter.requires_grad]
@@ -188,6 +176,13 @@ def trainable(policy: ActorCriticPolicy) -> Parameters:
 def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that log π depends on, in the policy's order."""
     return reached_by(log_prob_of(policy, obs, actions), trainable(policy))
+
+
+def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
+    """The trainable parameters that V depends on, in the policy's order."""
+    route = route_of(policy, with_critic=True)
+    values = evaluate(policy, route, obs, actions, with_values=True)[2]
+    return reached_by(cast(th.Tensor, values), trainable(policy))
 
 
 def reached_by(output: th.Tensor, parameters: Parameters) -> Parameters:

@@ -1,0 +1,40 @@
+"""Which parameters are the actor's, which the critic's, and which both share."""
+
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_reinforce.policies.evaluation import Parameters, actor_parameters, critic_parameters, trainable
+
+
+class ParameterGroups:
+    """
+    What log π depends on, what only V depends on, and what both do (a shared features extractor).
+
+    They are read from graphs, not from names. A network may use a part of itself in each rollout, so the graphs of
+    further rollouts are read until each trainable parameter has been reached.
+    """
+
+    def __init__(self) -> None:
+        self.present: tuple[tuple[int, bool], ...] = ()
+        self.of_actor: set[th.nn.Parameter] = set()
+        self.of_critic: set[th.nn.Parameter] = set()
+
+    def sort(
+        self, policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
+    ) -> tuple[Parameters, Parameters, Parameters]:
+        """The trainable parameters of the three groups, in the policy's order."""
+        parameters = trainable(policy)
+        present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
+        if self.present != present:
+            self.present, self.of_actor, self.of_critic = present, set(), set()
+        if not self.of_actor | self.of_critic >= set(parameters):
+            policy.set_training_mode(False)
+            self.of_actor.update(actor_parameters(policy, obs, actions))
+            self.of_critic.update(critic_parameters(policy, obs, actions))
+            if policy.share_features_extractor:
+                self.of_actor.update(policy.features_extractor.parameters())
+        only_critic = self.of_critic - self.of_actor
+        both = self.of_critic & self.of_actor
+        actor, critic, shared = ([p for p in parameters if p in group] for group in (self.of_actor, only_critic, both))
+        return actor, critic, shared
