@@ -57,7 +57,7 @@ INTEGERS = [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary
 def test_numbers_that_the_space_does_not_have(space, value, kind):
     value = np.full(space.shape, value)[()]
     env = of_two(fault="observation", at=5, value=value, observation_space=space)
-    with pytest.raises(ValueError, match=r"observation of environment 1 must .*\(step 4 since"):
+    with pytest.raises(ValueError, match=r"observation of environment 1 must .*\(num_timesteps=8\)"):
         make(kind, env).learn(400)
 
 
@@ -91,7 +91,7 @@ def test_other_forms_of_an_observation_are_accepted(form, kind):
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecMonitor, VecNormalize])
 def test_rewards_that_are_no_numbers(wrapper, value, kind):
     model = make(kind, wrapper(of_two(fault="reward", at=5, value=value)))
-    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(step 4 since"):
+    with pytest.raises(ValueError, match=r"reward of environment 1 must be a number.*\(num_timesteps=8\)"):
         model.learn(400)
 
 
