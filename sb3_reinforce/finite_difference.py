@@ -13,7 +13,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import choose
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -62,9 +61,10 @@ class FiniteDifference(BasePolicyGradient):
     other policies one after the other.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
-    the observations seen join them afterwards. Utilities are sums of the rewards before any scaling by it. If a
-    wrapper above it may change rewards (one that Stable-Baselines3 does not have), they are sums of that wrapper's
-    rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
+    the observations seen join them afterwards; the first update has the scale of the first observations. Utilities are
+    sums of the rewards before any scaling by it. If a wrapper above it may change rewards (one that Stable-Baselines3
+    does not have), they are sums of that wrapper's rewards, and VecNormalize must not learn their scale
+    (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -74,10 +74,11 @@ class FiniteDifference(BasePolicyGradient):
         and perturbations of shape ``(k, n)`` that returns a gradient of shape ``(n,)``
     :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
         ``torch.Generator`` that returns a tensor of shape ``(k, n)``
-    :param n_delta: k, the perturbations per update. None: 2n for the regression, n for the others, but at most 64
+    :param n_delta: k, the perturbations per update. None: 2n, but at most 64; where this is less than 1.5 n,
+        n/2, but at most 64
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
-    :param n_eval_episodes: Episodes behind each utility, which is their mean
+    :param n_eval_episodes: Episodes per candidate, whose utility is their mean return
     :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
         the start from differences, but environments idle until the longest episode of a round ends
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
@@ -180,12 +181,11 @@ class FiniteDifference(BasePolicyGradient):
 
     def _check_arguments(self) -> None:
         """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
-        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
-            choose(self, "n_delta", default_n_delta(self.estimator, n_parameters))
-            check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
+            self.n_delta = default_n_delta(n_parameters)
+        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""

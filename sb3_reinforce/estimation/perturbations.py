@@ -98,9 +98,15 @@ MAX_DEFAULT_N_DELTA = 64
 MIN_DEFAULT_DELTA_STD = 0.05
 
 
-def default_n_delta(estimator: object, n_parameters: int) -> int:
-    """``min(2n, 64)`` perturbations for the regression and ``min(n, 64)`` for the others: below 64 they determine ĝ."""
-    return min(2 * n_parameters if estimator == "regression" else n_parameters, MAX_DEFAULT_N_DELTA)
+def default_n_delta(n_parameters: int) -> int:
+    """
+    2n perturbations, but at most 64; where these are fewer than 1.5 n, half of n, but at most 64.
+
+    As many random directions as parameters are nearly dependent. Noise of variance 1 in the differences gives Gaussian
+    directions a ‖ĝ‖² of ``min(k, n) / (|n − k| − 1)`` on average, the mean of an inverse Wishart matrix.
+    """
+    k = min(2 * n_parameters, MAX_DEFAULT_N_DELTA)
+    return k if k >= 1.5 * n_parameters else min(n_parameters // 2, MAX_DEFAULT_N_DELTA)
 
 
 def default_delta_std(theta: th.Tensor) -> float:

@@ -161,14 +161,12 @@ def test_too_few_perturbations_for_a_regression_are_said():
 
 @pytest.mark.parametrize("estimator", ["regression", "central"])
 def test_an_estimator_of_this_package_is_the_same_as_a_function(estimator):
-    named, function = (make(estimator=each, n_delta=None) for each in (estimator, ESTIMATORS[estimator]))
-    assert named.n_delta == function.n_delta and function.estimator == estimator
+    assert make(estimator=ESTIMATORS[estimator]).estimator == estimator
 
 
 def test_the_rule_of_thumb():
-    n = make().n_parameters
-    assert make(estimator="regression", n_delta=None).n_delta == 2 * n
-    assert make(estimator="central", n_delta=None).n_delta == n
+    model = make(n_delta=None)
+    assert model.n_delta == 2 * model.n_parameters
     assert make(policy="MlpPolicy", n_delta=None).n_delta == 64
 
 

@@ -3,7 +3,8 @@
 import pytest
 import torch as th
 
-from sb3_reinforce.estimation import PERTURBATIONS, coordinate, rademacher, sphere
+from sb3_reinforce.estimation import PERTURBATIONS, coordinate, gaussian, rademacher, sphere
+from sb3_reinforce.estimation.perturbations import default_n_delta
 
 
 def generator(seed=0):
@@ -46,3 +47,13 @@ def test_coordinates_visit_all_parameters_with_alternating_sign():
         assert (rows.sum(1) == sign).all()
     assert th.equal(deltas.abs().sum(1), th.ones(10).double())
     assert (deltas[8:].sum(1) == 1).all()
+
+
+@pytest.mark.parametrize("n", [5, 20, 32, 42, 43, 64, 128, 300])
+def test_the_default_number_of_perturbations_does_not_multiply_noise(n):
+    """Noise of variance 1 in the differences gives ĝ = Δ⁺ ε a mean square of ‖Δ⁺‖², which is infinite for k = n."""
+    k = default_n_delta(n)
+    squares = th.stack([th.linalg.pinv(gaussian(k, n, generator(seed))).square().sum() for seed in range(200)])
+    expected = min(k, n) / (abs(n - k) - 1)
+    assert abs(squares.mean() - expected) < 5 * squares.std() / 200**0.5
+    assert expected <= 2
