@@ -1,5 +1,6 @@
 """REINFORCE with a memory, for tasks in which one observation does not say enough."""
 
+from collections.abc import Collection
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -26,8 +27,11 @@ __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstm
 
 # What sb3-contrib's policies compute for one step, and what computes it for whole sequences
 SEQUENCE_METHODS = {
+    "forward": "sequence_distribution",
+    "evaluate_actions": "sequence_distribution",
     "get_distribution": "sequence_distribution",
     "predict_values": "sequence_values",
+    "extract_features": "row_features",
     "_process_sequence": "remember",
 }
 
@@ -96,13 +100,8 @@ class RecurrentREINFORCE(REINFORCE):
                 f"policy must be one of {', '.join(self.policy_aliases)} of sb3_reinforce.recurrent or a subclass, got "
                 f"{policy.__name__}"
             )
-        own = {name for cls in policy.__mro__[: policy.__mro__.index(RecurrentPolicy)] for name in vars(cls)}
-        for step, sequence in SEQUENCE_METHODS.items():
-            if step in own and sequence not in own:
-                raise ValueError(
-                    f"policy={policy.__name__} overrides {step}, which is called for single steps: override {sequence} "
-                    "too, which is called for whole sequences in training"
-                )
+        classes = policy.__mro__[: policy.__mro__.index(RecurrentPolicy)]
+        check_sequence_methods(policy, {name for cls in classes for name in vars(cls)})
 
     def _setup_model(self) -> None:
         has_dicts = isinstance(self.observation_space, spaces.Dict)
@@ -152,6 +151,7 @@ class RecurrentREINFORCE(REINFORCE):
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
         policy = cast(RecurrentPolicy, self.policy)
+        check_sequence_methods(type(policy), vars(policy).keys())
         if self._actor is not None:
             # A callback has changed the policy during the rollout
             state = self._actor.state()
@@ -199,3 +199,13 @@ class RecurrentREINFORCE(REINFORCE):
         values = values.reshape(dones.shape)
         at_limits = dict(zip(terminal_obs, terminal_values, strict=True))
         return values, next_values_of(values, dones, last_values, at_limits)
+
+
+def check_sequence_methods(policy: type, own: Collection[str]) -> None:
+    """Refuse overridden methods that training, which asks for whole sequences, would not call."""
+    for step, sequence in SEQUENCE_METHODS.items():
+        if step in own and sequence not in own:
+            raise ValueError(
+                f"policy={policy.__name__} overrides {step}, which is called for single steps: override {sequence} "
+                "too, which is called for whole sequences in training"
+            )

@@ -164,7 +164,7 @@ def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple
 def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
     """log π(a|s) of the policy that acts, which is in evaluation mode."""
     # A user's evaluate_actions may differentiate
-    with th.set_grad_enabled(overrides(policy, "evaluate_actions")):
+    with th.set_grad_enabled(route.evaluate_actions and overrides(policy, "evaluate_actions")):
         return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
 
 

@@ -66,10 +66,12 @@ class RecurrentPolicy(ActorCriticPolicy):
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Make a features extractor, and refuse one whose size PyTorch's memories do not take."""
         extractor = super().make_features_extractor()
-        if not isinstance(extractor.features_dim, int):
+        size = extractor.features_dim
+        if not isinstance(size, int):
             raise ValueError(
-                "observation_space must have no MultiDiscrete part, whose size is not an int, for a policy with a "
-                f"memory: give these numbers as a Box, got {self.observation_space}"
+                f"The features_dim of {type(extractor).__name__} must be an int for a policy with a memory, got "
+                f"{size!r} of type {type(size).__name__} for {self.observation_space}: give MultiDiscrete observations "
+                "as a Box"
             )
         return extractor
 
@@ -110,7 +112,8 @@ class RecurrentPolicy(ActorCriticPolicy):
     def zero_state(self, n_envs: int) -> th.Tensor:
         """The state at the start of an episode, shape ``(n_envs, 2, 2, n_layers, n_hidden)``."""
         n_layers, _, n_hidden = self.lstm_hidden_state_shape
-        return self.value_net.weight.new_zeros(n_envs, 2, 2, n_layers, n_hidden)
+        parameter: th.Tensor = next(self.lstm_actor.parameters())
+        return parameter.new_zeros(n_envs, 2, 2, n_layers, n_hidden)
 
     def sequence_distribution(self, rows: Rows) -> Distribution:
         """π(·|o_0, ..., o_t) for each of n rows."""
@@ -126,7 +129,8 @@ class RecurrentPolicy(ActorCriticPolicy):
         elif self.critic is not None:
             latent = self.critic(self.row_features(rows, self.vf_features_extractor))
         else:
-            latent = self.actor_memory(rows).detach()
+            with th.no_grad():
+                latent = self.actor_memory(rows)
         return cast(th.Tensor, self.value_net(self.mlp_extractor.forward_critic(latent)))
 
     def actor_memory(self, rows: Rows) -> th.Tensor:

@@ -7,6 +7,7 @@ import torch as th
 from callbacks import Record
 from environments import Corridor, Random
 from gymnasium import spaces
+from models import moved_by_learning
 from recurrent_models import make_recurrent, set_n_steps
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
@@ -18,11 +19,10 @@ from sb3_reinforce.diagnostics import landscape
 from sb3_reinforce.recurrent import MlpLstmPolicy, RecurrentREINFORCE
 
 
-class OneStep(MlpLstmPolicy):
-    """Overrides what is called for single steps alone."""
-
-    def get_distribution(self, obs, lstm_states, episode_starts):
-        return super().get_distribution(obs, lstm_states, episode_starts)
+def one_step(method):
+    """A model whose policy overrides what is called for single steps alone."""
+    policy = type("OneStep", (MlpLstmPolicy,), {method: lambda self, *args: getattr(super(), method)(*args)})
+    return lambda env: RecurrentREINFORCE(policy, env)
 
 
 def memory(**policy_kwargs):
@@ -50,13 +50,16 @@ def observing(space):
         (lambda env: RecurrentREINFORCE("MlpPolicy", env), "policy must be a class or one of .*MlpLstmPolicy"),
         (lambda env: RecurrentREINFORCE(RecurrentActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
         (lambda env: RecurrentREINFORCE(ActorCriticPolicy, env), "policy must be one of MlpLstmPolicy"),
-        (lambda env: RecurrentREINFORCE(OneStep, env), "override sequence_distribution too"),
+        (one_step("get_distribution"), "OneStep overrides get_distribution, .* override sequence_distribution too"),
+        (one_step("forward"), "overrides forward, .* override sequence_distribution too"),
+        (one_step("evaluate_actions"), "overrides evaluate_actions, .* override sequence_distribution too"),
+        (one_step("extract_features"), "overrides extract_features, .* override row_features too"),
         (
             lambda env: RecurrentREINFORCE("MultiInputLstmPolicy", env),
             "policy must be MlpLstmPolicy for observations in",
         ),
-        (observing(spaces.MultiDiscrete([2, 3])), "observation_space must have no MultiDiscrete"),
-        (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "MultiDiscrete part, .* as a Box, got Dict"),
+        (observing(spaces.MultiDiscrete([2, 3])), "features_dim of FlattenExtractor must be an int .* as a Box"),
+        (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "features_dim of CombinedExtractor .* as a Box"),
         (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
         (
             lambda env: landscape(RecurrentPPO("MlpLstmPolicy", env, device="cpu")),
@@ -82,6 +85,29 @@ def observing(space):
 def test_what_a_memory_cannot_be_is_said_in_a_sentence(call, sentence):
     with pytest.raises(ValueError, match=sentence):
         call(make_vec_env("CartPole-v1"))
+
+
+@pytest.mark.parametrize("method", ["get_distribution", "predict_values"])
+def test_a_method_for_single_steps_that_is_replaced_later_is_refused(method):
+    model = make_recurrent(double=False, n_episodes=2).learn(1)
+    setattr(model.policy, method, getattr(model.policy, method))
+    with pytest.raises(ValueError, match=f"policy=MlpLstmPolicy overrides {method}, which is called for single steps"):
+        model.learn(1)
+
+
+class TwoLayers(MlpLstmPolicy):
+    """A critic with another output."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        width = self.mlp_extractor.latent_dim_vf
+        self.value_net = th.nn.Sequential(th.nn.Linear(width, 3), th.nn.Tanh(), th.nn.Linear(3, 1))
+
+
+@pytest.mark.parametrize("baseline", ["value", "none"])
+def test_a_user_may_build_another_critic(baseline):
+    moved = moved_by_learning(RecurrentREINFORCE(TwoLayers, "CartPole-v1", baseline=baseline, seed=0, device="cpu"), 1)
+    assert "lstm_actor.weight_hh_l0" in moved and ("value_net.2.weight" in moved) == (baseline == "value")
 
 
 @pytest.mark.parametrize("at", ["rollout_start", "step", "rollout_end"])

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from enumeration import make_model
+from recurrent_models import make_recurrent
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -98,3 +99,13 @@ def test_an_estimate_takes_different_steps(n, expected):
     obs, actions = some_steps(policy, {"numbers": th.arange(n)}, th.arange(n))
     assert len(actions.unique()) == len(actions) == expected
     assert th.equal(obs["numbers"], actions)
+
+
+@pytest.mark.parametrize("policy", ["MlpLstmPolicy", "CnnLstmPolicy"])
+def test_the_divergence_of_a_recurrent_policy_is_evaluated_without_gradients(policy):
+    model = make_recurrent(policy, double=False, n_episodes=2).learn(1)
+    original, modes = model.policy.sequence_distribution, []
+    model.policy.sequence_distribution = lambda rows: modes.append(th.is_grad_enabled()) or original(rows)
+    batch = training_batch(model.rollout, model.rollout_buffer, False)
+    sampled_divergence(model.policy, route_of(model.policy), batch.observations, batch.actions, th.zeros(()))
+    assert modes == [False]
