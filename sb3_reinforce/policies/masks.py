@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
@@ -37,7 +38,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     shape ``(n,)``, 1 where an action is allowed: n is the number of actions for ``Discrete``, and for
     ``MultiDiscrete`` the sum of the numbers of each dimension, one dimension after the other. This is the contract of
     sb3-contrib's ``MaskablePPO``, so its environments with these actions can be wrapped as they are, and so can its
-    ``ActionMasker``.
+    ``ActionMasker``. In a terminal state the environment is not asked, and the mask is 0.
 
     ``MaskedPolicy`` obeys the mask; other policies take it for a feature. ``VecNormalize`` needs ``norm_obs_keys``,
     since a mask cannot be normalized, and frames are stacked below this wrapper, not by ``VecFrameStack``.
@@ -65,15 +66,17 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         """As ``gymnasium.Env.reset``, with the mask in the observation."""
         obs, info = self.env.reset(seed=seed, options=options)
-        return self._with_mask(obs, is_over=False), info
+        return self._with_mask(obs, self._allowed(is_over=False)), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
         """As ``gymnasium.Env.step``, with the mask in the observation."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._with_mask(obs, is_over=terminated or truncated), reward, terminated, truncated, info
+        # An environment need not know the actions of a terminal state
+        mask = np.zeros(self._n_actions, dtype=bool) if terminated else self._allowed(is_over=truncated)
+        return self._with_mask(obs, mask), reward, terminated, truncated, info
 
-    def _with_mask(self, obs: Any, is_over: bool) -> dict[str, Any]:
-        """An observation with the mask of the present state."""
+    def _allowed(self, is_over: bool) -> NDArray[np.bool_]:
+        """The mask of the present state."""
         masks = self.env.get_wrapper_attr("action_masks")()
         try:
             numbers = np.ravel(masks)
@@ -92,6 +95,10 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
                 f"action_masks() must allow an action{each} of {self.action_space} until the episode is over, "
                 f"got {masks!r}"
             )
+        return mask
+
+    def _with_mask(self, obs: Any, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """An observation with a mask."""
         parts = obs if self._has_dicts else {OBSERVATION: obs}
         return {**parts, KEY: mask.astype(np.int8)}
 

@@ -202,3 +202,24 @@ def test_what_an_environment_does_to_its_mask_later_does_not_count():
     obs, _ = env.reset()
     masks[:] = 0
     assert env.observation_space.contains(obs) and obs["action_mask"].all()
+
+
+class Ended(Masked):
+    """Knows no actions when its episode is over."""
+
+    def action_masks(self):
+        assert self.t < self.length
+        return super().action_masks()
+
+
+@algorithms
+def test_an_environment_is_not_asked_for_the_actions_of_a_terminal_state(algorithm):
+    def ended():
+        return ActionMaskObservation(Ended(*TASKS["discrete"], lengths=(3,), truncate=False))
+
+    make(algorithm, make_vec_env(ended, 2)).learn(32)
+    env = ended()
+    env.reset(seed=0)
+    steps = [env.step(int(env.unwrapped.action_masks().argmax())) for _ in range(3)]
+    assert [terminated for _, _, terminated, *_ in steps] == [False, False, True]
+    assert env.observation_space.contains(steps[-1][0]) and not steps[-1][0]["action_mask"].any()
