@@ -7,7 +7,6 @@ from functools import wraps
 from itertools import zip_longest
 from typing import Any, ClassVar, TypeVar, cast
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -88,11 +87,15 @@ class Distributed(BaseAlgorithm):
         attributes = {name: value for name, value in vars(self).items() if isinstance(value, SHARED)}
         del attributes["verbose"]
         policy = {name: values.cpu() for name, values in self.policy.state_dict().items()}
-        return {"policy": policy, "attributes": attributes, "moments": self._moments()}
+        # A search draws candidates of the trainable parameters
+        trainable = [parameter.requires_grad for parameter in self.policy.parameters()]
+        return {"policy": policy, "trainable": trainable, "attributes": attributes, "moments": self._moments()}
 
     def adopt(self, state: dict[str, Any]) -> None:
         """Become what process 0 is."""
         self.policy.load_state_dict(state["policy"])
+        for parameter, is_trainable in zip(self.policy.parameters(), state["trainable"], strict=True):
+            parameter.requires_grad_(is_trainable)
         vars(self).update(state["attributes"])
         for own, total in zip(self._moments(), state["moments"], strict=True):
             vars(own).update(vars(total))
@@ -163,9 +166,9 @@ class Distributed(BaseAlgorithm):
         callback = self._init_callback([])
         try:
             self.adopt(*processes.receive())
-            if self.num_timesteps == 0 or self._last_obs is None:
-                self._last_obs = cast(Any, self.env).reset()
-                self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
+            if self.num_timesteps == 0:
+                # Reset in the round: what VecNormalize observes before it would be lost, or scale candidates otherwise
+                self._last_obs = None
             while True:
                 self.collect_part(callback)
                 self.adopt(*processes.receive())

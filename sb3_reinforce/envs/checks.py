@@ -1,4 +1,4 @@
-"""Checks of what environments return. Each error names the environment; ``learn`` adds the step."""
+"""Checks of what environments return. Each error names the environment; ``learn`` adds ``num_timesteps``."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -25,6 +25,7 @@ SEARCHES = {
     "central": {"estimator": "central", "n_delta": 3},
     "two utilities": {"estimator": "forward", "n_delta": 5, "perturbation": "coordinate"},
     "regression": {"estimator": "regression", "n_delta": 40, "n_eval_episodes": 2},
+    "frozen": {"estimator": "central", "n_delta": 3},
 }
 
 
@@ -33,6 +34,9 @@ def search(rank, n_envs, n_updates, names):
     for name in names:
         env = make_vec_env("CartPole-v1", n_envs)
         model = make("search", env, seed=5, **{**SEARCHES[name], "common_random_numbers": True})
+        if name == "frozen" and rank == 0:
+            # As a callback does, which is called in process 0 only
+            model.policy.action_net.requires_grad_(False)
         model.learn(10**6, lambda values, _, model=model: model._n_updates < n_updates)
         answers[name] = plain(model.theta), model._n_updates, len(model.ep_info_buffer)
     return answers
@@ -249,3 +253,28 @@ def returns_in_window(rank):
 
 def test_the_window_of_the_log_has_episodes_of_all_processes(tmp_path):
     assert in_processes(2, returns_in_window, tmp_path)[0] == [0.0, 3.0]
+
+
+def norm_of_change(rank):
+    """Of θ, by the differences of candidates that are all θ but for rounding."""
+    env = VecNormalize(make_vec_env("Pendulum-v1", 1), norm_reward=False)
+    model = make("search", env, n_delta=4, delta_std=1e-30, common_random_numbers=True, seed=0)
+    before = model.theta
+    model.learn(1)
+    return float((model.theta - before).norm())
+
+
+def test_candidates_of_all_processes_are_compared_on_one_scale(tmp_path):
+    of_process_0, _ = in_processes(2, norm_of_change, tmp_path)
+    assert of_process_0 == 0
+
+
+def test_a_default_is_chosen_again_for_another_number_of_processes(tmp_path):
+    path = tmp_path / "model"
+    make("episodes", corridors(12), n_episodes=None).save(path)
+
+    def load(rank):
+        return KINDS["episodes"][0].load(path, device="cpu").n_episodes
+
+    assert load(0) == 16
+    assert in_processes(2, load, tmp_path) == [24, 24]
