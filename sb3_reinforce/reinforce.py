@@ -67,12 +67,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"`` or
     ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no normalization or
     clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
-    gradient where the noise depends on the features.
+    gradient where the noise depends on the features. So are dropout and batch normalization, with which the policy that
+    is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
-    left out, since its return is not known. The value network is then never evaluated, except by a policy
-    that overrides ``forward``, ``evaluate_actions`` or ``extract_features``, and never used.
+    left out, since its return is not known. The value network is then not used, and evaluated only by a policy that
+    overrides ``forward``, ``evaluate_actions`` or ``extract_features``.
 
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
     A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
@@ -540,8 +541,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        goes_on = self._last_obs is not None
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        if self.n_steps is None and self.num_timesteps > 0:
+        if self.n_steps is None and self.num_timesteps > 0 and goes_on:
             # The environments may have been used since their last episodes ended
             self._last_obs = None
         # The first rollout has the temperature of the start, not the final one of an earlier run

@@ -117,3 +117,20 @@ def test_a_policy_acts_alike_before_a_save_and_after_a_load(tmp_path):
     loaded, obs = type(model).load(tmp_path / "model"), th.randn(64, 4)
     assert th.equal(*(each.policy.get_distribution(obs).distribution.probs for each in (model, loaded)))
     assert np.array_equal(*(each.predict(obs.numpy(), deterministic=True)[0] for each in (model, loaded)))
+
+
+def test_whole_episodes_go_on_from_one_reset(tmp_path):
+    """So the seeds that the user sets are those of the first episodes."""
+    env, other = (make_vec_env("Pendulum-v1", 2, seed=0) for _ in range(2))
+    model = make("episodes", env, seed=0).learn(1)
+    model.save(tmp_path / "model")
+    loaded = KINDS["episodes"][0].load(tmp_path / "model", other, device="cpu", restore_random_state=True)
+    first = []
+    for each in (loaded, model):
+        each.env.seed(7)
+        random_state = th.get_rng_state()
+        each.learn(1, reset_num_timesteps=False)
+        first.append(each.rollout_buffer.observations[0].tolist())
+        th.set_rng_state(random_state)
+    env.seed(7)
+    assert first == [env.reset().tolist()] * 2
