@@ -109,7 +109,9 @@ class GymnasiumVecEnv(VecEnv):
         elif hasattr(self.env.unwrapped, "get_attr"):
             values = self.env.unwrapped.get_attr(attr_name)
         else:
-            values = [getattr(self.env, attr_name)] * self.num_envs
+            # Gymnasium's wrappers do not pass attributes on
+            owner = self.env if hasattr(self.env, attr_name) else self.env.unwrapped
+            values = [getattr(owner, attr_name)] * self.num_envs
         return [values[i] for i in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:

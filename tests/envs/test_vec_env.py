@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from environments import Corridor, Random
 from gymnasium import spaces
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import TransformAction, TransformReward
 from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from models import make
@@ -172,6 +173,9 @@ def test_attributes_and_methods_where_the_environment_can():
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("truncate", True, indices=[0])
     assert native().get_attr("max_episode_steps") == [500] * N_ENVS
+    below = CartPoleVectorEnv(N_ENVS)
+    below.metadata = below.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+    assert GymnasiumVecEnv(VectorWrapper(below)).get_attr("max_episode_steps") == [500] * N_ENVS
     with pytest.raises(NotImplementedError, match="single copies"):
         native().env_method("render")
     env = synced(Corridor, vector_env=AsyncVectorEnv)
