@@ -73,8 +73,8 @@ plt.show()
 # %% [markdown]
 # An untrained critic knows nothing of the future: at $\lambda = 0$ every weight is almost the same, and neither signal
 # nor noise is left. A trained one keeps most of the gradient, with less noise than at $\lambda = 1$. The usual
-# $\lambda = 0.95$ then has less noise too, and a small bias (with six seeds and 2000 episodes 4 to 14 % of the
-# gradient). At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors.
+# $\lambda = 0.95$ then has less noise too, and a small bias. At $\lambda = 1$ a wrong critic is only a bad baseline; at
+# $\lambda = 0$ the policy follows its errors.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()
