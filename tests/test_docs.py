@@ -1,5 +1,7 @@
 """What the README and the pages of ``docs/`` show can be run, and is there."""
 
+import ast
+import inspect
 import re
 import runpy
 import shlex
@@ -8,6 +10,11 @@ from pathlib import Path
 
 import pytest
 import rl_zoo3
+from stable_baselines3 import PPO
+from test_architecture import FOREIGN
+
+from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -160,3 +167,28 @@ def test_tables_are_those_of_the_rows(name: str, monkeypatch: pytest.MonkeyPatch
 
 def test_the_readme_is_short() -> None:
     assert len(TEXTS["README.md"].splitlines()) <= 130
+
+
+def test_the_table_of_ppos_arguments_has_their_defaults():
+    """Each cell has arguments with their default behind them, "`name` (default)", or calls with it."""
+    table = TEXTS["start.md"].partition("| PPO (default) | REINFORCE (default) |")[2].partition("\n\n")[0]
+    models = [algorithm("MlpPolicy", "CartPole-v1", device="cpu") for algorithm in (PPO, REINFORCE)]
+    found = 0
+    for line in table.strip().splitlines()[1:]:
+        for cell, model in zip(line.strip("|").split("|"), models, strict=True):
+            for name, default in re.findall(r"`(\w+)` \(([\d.e-]+|True|False)\)", cell):
+                assert getattr(model, name) == ast.literal_eval(default), name
+                found += 1
+            for name, default in re.findall(r"`learn\((\w+)=(\d+)\)`", cell):
+                assert inspect.signature(model.learn).parameters[name].default == int(default)
+                found += 1
+    assert found >= 16
+    assert inspect.signature(FiniteDifference.learn).parameters["log_interval"].default == 1
+
+
+def test_the_tables_of_pitfalls_and_private_names_are_complete():
+    rows = re.findall(r"^\| `(\w+)` \| ", TEXTS["gradient_lab.md"], re.MULTILINE)
+    assert rows == list(PITFALLS)
+    table = TEXTS["ARCHITECTURE.md"].partition("| name | where | why |")[2]
+    names = [name for line in table.splitlines() if line.startswith("| `") for name in re.findall(r"`(\S+)`", line)]
+    assert {name.strip("*") for name in names if name.strip("*").startswith("_")} == FOREIGN.keys()

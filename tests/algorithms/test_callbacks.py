@@ -24,11 +24,20 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 
-LOCALS = {"self", "new_obs", "rewards", "dones", "infos"}
-LOCALS_OF_A2C = {
-    *(LOCALS | {"env", "rollout_buffer", "total_timesteps", "tb_log_name"}),
-    *("actions", "clipped_actions", "values", "log_probs", "n_steps"),
-}
+
+@pytest.mark.parametrize("kind", ["steps", "episodes"])
+def test_callbacks_find_the_locals_of_a2c(kind):
+    """Also after a time limit, at which A2C has more."""
+    env = make_vec_env(lambda: Corridor((4,), truncate=True), 2)
+    models = [make(kind, env), A2C("MlpPolicy", env, n_steps=8, device="cpu")]
+    ours, theirs = (Record(lambda model, i=i: set(records[i].locals), "step") for i in range(2))
+    records = [ours, theirs]
+    for model, record in zip(models, records, strict=True):
+        model.learn(16, record)
+    left_out = {"obs_tensor", "n_rollout_steps", "idx", "done", "terminal_value"}
+    assert ours.records[-1] >= theirs.records[-1] - left_out and left_out <= theirs.records[-1]
+    (place, *_), obs = zip(*ours.locals["terminal_obs"].items(), strict=True)
+    assert place == (3, 0) and all(env.observation_space.contains(each) for each in obs)
 
 
 @all_kinds
@@ -36,7 +45,8 @@ def test_a_callback_stops_training_at_the_very_step(kind):
     model = make(kind, make_vec_env(lambda: Corridor((4,)), 2))
 
     def stop(locals_, globals_):
-        assert locals_.keys() >= (LOCALS | {"finished"} if kind == "search" else LOCALS_OF_A2C)
+        assert locals_.keys() >= {"self", "new_obs", "rewards", "dones", "infos"}
+        assert kind != "search" or "finished" in locals_
         return np.bool_(model.num_timesteps < 42)
 
     ends = Record(lambda model: None)
@@ -61,7 +71,6 @@ def test_callbacks_of_sb3(kind, tmp_path):
         EvalCallback(eval_env, callback_on_new_best=stop, best_model_save_path=tmp_path, eval_freq=60, verbose=0),
         EveryNTimesteps(80, every),
         LogEveryNTimesteps(70),
-        StopTrainingOnMaxEpisodes(40),
     ]
     with pytest.warns(Warning, match="rich is experimental"):
         make(kind, env).learn(300, callback=callbacks, progress_bar=True)
@@ -132,3 +141,15 @@ def test_a_callback_may_shape_the_rewards_in_place():
 
     model = make("steps").learn(8, callback=shape)
     assert (model.rollout_buffer.rewards == 5).all()
+
+
+@all_kinds
+@pytest.mark.parametrize("stop", ["episodes", "reward"])
+def test_callbacks_of_sb3_stop_the_training(kind, stop):
+    """After three episodes of each of two environments, or at the first evaluation, all of four steps."""
+    env, eval_env = (make_vec_env(lambda: Corridor((4,)), n_envs) for n_envs in (2, 1))
+    callback = StopTrainingOnMaxEpisodes(3)
+    if stop == "reward":
+        threshold = StopTrainingOnRewardThreshold(reward_threshold=4)
+        callback = EvalCallback(eval_env, callback_on_new_best=threshold, eval_freq=12, verbose=0)
+    assert make(kind, env).learn(1000, callback).num_timesteps == 24

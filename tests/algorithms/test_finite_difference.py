@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.estimation import ESTIMATORS, central_difference, fit_quality
 from sb3_reinforce.estimation.perturbations import default_delta_std
+from sb3_reinforce.sampling.candidates import seeds_of
 
 
 def test_an_estimate_before_learn_is_refused():
@@ -34,7 +35,23 @@ def test_the_gradient_is_the_estimator_applied_to_the_utility():
     deltas = candidates[0] - theta
     expected = central_difference(lambda x: -((x[..., 0] - 3) ** 2) * s_squared[0], theta[None], deltas[:, None])
     th.testing.assert_close(estimate.gradient, expected, rtol=1e-3, atol=1e-4)
-    assert float(deltas.std()) < 3 * estimate.delta_std
+
+
+def test_perturbations_are_multiplied_by_delta_std():
+    """By a schedule at its present value: after a third of the training it is 0.4."""
+    model = make(Line(), perturbation=lambda k, n, generator: th.ones(k, n), delta_std=lambda left: 0.6 * left)
+    callback = Record(lambda model: None)
+    model.learn(18, callback)
+    model._update_current_progress_remaining(6, 18)
+    estimate = model.estimate_gradient(callback)
+    th.testing.assert_close(estimate.candidates[:3] - model.theta, th.full((3, 1), 0.4, dtype=th.float64))
+    assert estimate.delta_std == pytest.approx(0.4)
+
+
+def test_all_episodes_of_a_pair_have_seeds_that_no_other_pair_has():
+    seeds = seeds_of((2, 3, 7), n_episodes=2, first_seed=5)
+    plus, minus = seeds.reshape(2, 3, 2)
+    assert (plus == minus).all() and len(np.unique(plus)) == 6
 
 
 @pytest.mark.parametrize("bound", [None, 0.01])
@@ -69,6 +86,26 @@ def test_the_standard_error_is_the_spread_of_the_gradient(estimator, common_rand
     standard_error = th.stack([fit.standard_error for fit in errors]).square().mean().sqrt()
     spread = th.stack([each.gradient for each in found]).std()
     assert float(standard_error) == pytest.approx(float(spread), rel=0.2)
+
+
+def test_the_fit_of_central_differences_is_the_regression_within_pairs():
+    """Of (U₊ − U₋) / 2 on δ without an intercept: what the start of a pair adds is not left to explain."""
+    callback = Record(lambda model: None)
+    env = make_vec_env(Levels, 4, seed=0)
+    model = make(env, n_delta=6, deterministic=False, learning_rate=0.0).learn(1, callback)
+    estimate = model.estimate_gradient(callback)
+    model.train(estimate)
+    plus, minus = estimate.utilities.reshape(2, 6)
+    x = (estimate.candidates.reshape(2, 6)[0] - model.theta).numpy()
+    y = (plus - minus).numpy() / 2
+    slope = x @ y / (x @ x)
+    residuals = y - slope * x
+    # Each pair has two residuals of this size and opposite signs, and one degree of freedom
+    variance = 2 * residuals @ residuals / 5
+    logged = model.logger.name_to_value
+    assert logged["train/r_squared"] == pytest.approx(1 - residuals @ residuals / (y @ y))
+    assert logged["train/residual_std"] == pytest.approx(variance**0.5)
+    assert logged["train/standard_error"] == pytest.approx((variance / (2 * x @ x)) ** 0.5)
 
 
 def test_utilities_that_differ_by_rounding_make_no_step():
@@ -180,3 +217,12 @@ def test_perturbations_are_one_percent_of_theta_or_a_twentieth():
 def test_it_learns_cart_pole(seed):
     model = FiniteDifference("LinearPolicy", make_vec_env("CartPole-v1", 1, seed=seed), seed=seed, device="cpu")
     assert evaluate_policy(model.learn(50_000), model.get_env(), 50)[0] >= 475
+
+
+def test_rewards_that_a_callback_changes_do_not_count():
+    def thetas(factor):
+        scale = Record(lambda model: scale.locals["rewards"].__imul__(factor), "step")
+        model = make("CartPole-v1", standardize_utilities=False).learn(60, scale)
+        return model.theta
+
+    assert th.equal(thetas(1.0), thetas(-9.0))

@@ -8,10 +8,9 @@ import os
 import warnings
 
 import numpy as np
-import pytest
 from environments import Random
 from gymnasium import spaces
-from hypothesis import HealthCheck, given, reject, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
@@ -142,22 +141,3 @@ def test_valid_reinforce(env, arguments):
 @given(environments(), st.fixed_dictionaries({"n_delta": st.integers(2, 5)}, optional=FINITE_DIFFERENCE_STRATEGIES))
 def test_valid_search(env, arguments):
     assert_trains(FiniteDifference, env, arguments)
-
-
-odd = st.sampled_from(["x", None, [1], float("nan"), float("inf"), -float("inf"), True, 1j, b"mean", object(), -1, 0])
-anything = st.one_of(odd, st.integers(), floats(), st.text(max_size=3))
-
-
-@pytest.mark.parametrize("algorithm", TABLES)
-@fuzzed
-@given(data=st.data())
-def test_what_a_table_refuses_the_algorithm_refuses(algorithm, data):
-    name = data.draw(st.sampled_from(sorted(TABLES[algorithm])))
-    value = data.draw(st.one_of(anything, anything.map(lambda value: lambda progress: value)))
-    try:
-        TABLES[algorithm][name](name, value)
-    except (TypeError, ValueError):
-        with pytest.raises((TypeError, ValueError), match=name):
-            algorithm(**{"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu", name: value})
-    else:
-        reject()

@@ -133,3 +133,13 @@ def test_what_a_callback_sets_is_used():
     model = make("steps", max_grad_norm=None).learn(32, callback=At(8, lambda model: vars(model).update(values)))
     assert model.logger.name_to_value["train/grad_norm"] > 100
     assert temperature_of(model) == pytest.approx(3)
+
+
+def test_a_policy_that_is_saved_alone_has_no_temperature(tmp_path):
+    model = make("steps", temperature=0.25, seed=0)
+    model.policy.save(tmp_path / "policy")
+    obs = th.zeros(1, 4) + 1
+    alone = type(model.policy).load(tmp_path / "policy", device="cpu").get_distribution(obs).distribution
+    with th.no_grad():
+        own = model.policy.get_distribution(obs).distribution
+    th.testing.assert_close(own.probs, (alone.logits / 0.25).softmax(-1).detach())

@@ -38,21 +38,44 @@ WRONG = {
 }
 
 
-def wrong_values(check):
-    """What an entry of a table must refuse: values of other types, and those just out of its range."""
-    keywords = getattr(check, "keywords", {})
-    if "check" in keywords:
-        return [value for value in wrong_values(keywords["check"]) if value is not None]
-    values = list(WRONG[getattr(check, "func", check).__name__])
-    if "low" in keywords:
-        values += [keywords["low"] - 0.1, keywords["low"] - 1]
-    if keywords.get("high", INF) < INF:
-        values.append(keywords["high"] * 1.1)
-    if keywords.get("above"):
-        values.append(keywords.get("low", 0))
-    if keywords.get("high") == INF:
+COUNTS = (
+    "n_steps", "n_episodes", "episodes_per_start", "n_critic_updates", "batch_size", "max_episode_steps",
+    "stats_window_size", "n_delta", "n_eval_episodes", "n_top", "log_interval",
+)  # fmt: skip
+# Numbers just outside the range of each argument
+OUTSIDE = dict.fromkeys(COUNTS, (0, -1)) | {
+    **dict.fromkeys(("gamma", "gae_lambda"), (-0.01, 1.01)),
+    **dict.fromkeys(("ent_coef", "vf_coef", "target_kl"), (-1e-9,)),
+    **dict.fromkeys(("learning_rate", "critic_learning_rate", "min_std"), (-1e-9, 1.1e6)),
+    **dict.fromkeys(("temperature", "delta_std"), (0, 1.1e6)),
+    "max_grad_norm": (0, -1),
+    "total_timesteps": (-1,),
+    "seed": (-1, 2**32),
+    "sde_sample_freq": (-2,),
+    "verbose": (-1,),
+}
+HAVE_RANGES = {"check_number", "CheckedSchedule", "check_integer", "check_verbose"}
+
+
+def kind_of(check):
+    """The name of the function that checks an argument, and whether None passes."""
+    inner = getattr(check, "keywords", {}).get("check")
+    named = check if inner is None else inner
+    return getattr(named, "func", named).__name__, inner is not None
+
+
+def wrong_values(name, check):
+    """What an argument must refuse: values of other types, and numbers just out of its range."""
+    kind, takes_none = kind_of(check)
+    values = [value for value in WRONG[kind] if not (value is None and takes_none)]
+    if name == "max_grad_norm":
         values.remove(INF)
-    return values
+    return [*values, *OUTSIDE.get(name, ())]
+
+
+def test_every_number_has_a_range():
+    tables = REINFORCE_ARGUMENTS | FINITE_DIFFERENCE_ARGUMENTS | LEARN_ARGUMENTS
+    assert {name for name, check in tables.items() if kind_of(check)[0] in HAVE_RANGES} == OUTSIDE.keys()
 
 
 def test_the_tables_name_all_arguments():
@@ -63,7 +86,7 @@ def test_the_tables_name_all_arguments():
 
 @pytest.mark.parametrize(("algorithm", "name"), [(each, name) for each, table in TABLES.items() for name in table])
 def test_a_wrong_argument_is_named_with_its_value(algorithm, name):
-    for value in wrong_values(TABLES[algorithm][name]):
+    for value in wrong_values(name, TABLES[algorithm][name]):
         with pytest.raises((TypeError, ValueError), match=name) as error:
             algorithm(**{"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu", name: value})
         assert callable(value) or str(value) in str(error.value)
@@ -87,7 +110,7 @@ USED_BEFORE = {
 def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name, at):
     model = make(kind)
     before = deepcopy(model.get_parameters())
-    for value in wrong_values(TABLES[type(model)][name]):
+    for value in wrong_values(name, TABLES[type(model)][name]):
         given = getattr(model, name)
         change = Record(lambda model, value=value: setattr(model, name, value), "rollout_start")
         if at == "before":
@@ -113,7 +136,7 @@ def test_a_callback_may_change_the_kind_of_rollout_at_its_start(first, second):
 @pytest.mark.parametrize("name", LEARN_ARGUMENTS)
 def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
     model = make(kind)
-    for value in wrong_values(LEARN_ARGUMENTS[name]):
+    for value in wrong_values(name, LEARN_ARGUMENTS[name]):
         with pytest.raises((TypeError, ValueError), match=name):
             model.learn(**{"total_timesteps": 8, name: value})
     assert model._last_obs is None and model.num_timesteps == 0

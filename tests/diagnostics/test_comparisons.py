@@ -180,15 +180,17 @@ def test_a_users_function_is_a_row_and_the_table_prints():
 
 def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
-    frame = pandas.DataFrame(table.to_records()).set_index("baseline")
-    assert frame.equals(table.to_pandas())
-    assert frame.loc["none", "ratio"] == 1
+    frame = table.to_pandas()
+    assert isinstance(frame, pandas.DataFrame) and frame.index.tolist() == table.names
+    for row in table:
+        assert frame.loc[row.baseline, "ratio"] == row.ratio.value
+        assert frame.loc[row.baseline, "variance_low"] == row.variance.low
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pandas"):
         table.to_pandas()
 
 
-def test_with_new_noise_at_each_step_they_are():
+def test_episodes_with_new_noise_at_each_step_are_independent():
     """The mean of 20 episodes varies over repetitions as their own variance says, tr Σ / 20."""
     model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, sde_sample_freq=1, device="cpu", seed=0)
     table = compare_baselines(model, 400, ["none"], n_resamples=10)

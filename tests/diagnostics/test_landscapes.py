@@ -1,6 +1,7 @@
 """Utilities on a plane, estimators at one θ, and the pictures of what was measured."""
 
 import importlib
+import math
 import sys
 
 import numpy as np
@@ -201,6 +202,7 @@ def test_every_picture_can_be_saved(tmp_path):
     drawn = {line.get_ydata()[0]: line for line in ax.get_lines() if len(line.get_xdata()) == 1}
     for y, row in enumerate(list(table)[:-1]):
         assert drawn[y].get_xdata() == [row.ratio.value]
+        assert ax.collections[y].get_segments()[0].tolist() == [[row.ratio.low, y], [row.ratio.high, y]]
         assert (drawn[y].get_markerfacecolor() == "white") == (row.bias != 0)
     save(ax, tmp_path / "baselines.png")
     scores = np.random.rand(5, 8)
@@ -214,8 +216,16 @@ def test_every_picture_can_be_saved(tmp_path):
     ax = plots.plot_landscape(found)
     assert "3 × 3 points of 2 episodes" in ax.get_title() and ax.get_xlim() == (-1.5, 1.5)
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["one (1)", "three (3)"]
+    for arrows, steps in zip(ax.collections, found.steps.values(), strict=True):
+        drawn_steps = np.stack([arrows.U, arrows.V], axis=1)
+        np.testing.assert_allclose(th.cosine_similarity(th.tensor(drawn_steps), th.tensor(np.atleast_2d(steps))), 1)
     save(ax, tmp_path / "landscape.png")
-    ax = plots.plot_variances({"none": np.random.rand(3, 4) + 1}, [2, 4, 8, 16])
+    variances = np.random.rand(3, 4) + 1
+    ax = plots.plot_variances({"none": variances}, [2, 4, 8, 16])
+    (bars,) = ax.collections
+    middle, half = variances.mean(0), 1.959964 * variances.std(0, ddof=1) / 3**0.5
+    drawn_bars = np.array([segment[:, 1] for segment in bars.get_segments()])
+    np.testing.assert_allclose(drawn_bars, np.stack([middle - half, middle + half], axis=1), rtol=1e-6)
     save(ax, tmp_path / "variances.png")
 
 
@@ -231,6 +241,17 @@ def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
     mean, low, high = plots.interquartile_interval(np.random.randn(40, 2, 3), 200, 0.95, 0)
     assert ((low < mean) & (mean < high)).all()
     assert (high - low < 1).all()
+
+
+def test_the_runs_of_each_task_are_resampled_separately():
+    """Each of eight scores is drawn with a chance of 1/4. Runs that were drawn for both tasks would come in pairs."""
+    runs = np.zeros((4, 2, 1))
+    runs[0] = 1
+    resampled = [plots.interquartile_interval(runs, 1, 0.0, seed)[1].item() for seed in range(400)]
+    # If k of eight scores are 1, so are k − 2 of the middle four
+    chances = np.array([math.comb(8, k) * 0.25**k * 0.75 ** (8 - k) for k in range(9)])
+    expected = chances @ np.clip((np.arange(9) - 2) / 4, 0, 1)
+    assert abs(np.mean(resampled) - expected) < 5 * np.std(resampled) / 20
 
 
 def test_curves_of_a_single_run_are_refused():

@@ -57,73 +57,85 @@ one_action = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([9
 narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
 
 
-@pytest.mark.parametrize(
-    ("name", "argument", "env", "timesteps", "kwargs"),
-    [
-        ("rate_too_large", "Lower learning_rate (now 1)", "CartPole-v1", 2000, {"learning_rate": 1.0}),
-        ("unscaled_returns", "VecNormalize", rewarded((5,), lambda t, action: 5e3), 64, {}),
-        ("too_few_episodes", "n_episodes", rewarded((4,), noise), 400, whole),
-        ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
-        ("total_return", "reward_to_go=True", rewarded((4,)), 64, {**whole, "n_episodes": 4, "reward_to_go": False}),
-        ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
-        ("useless_critic", "n_critic_updates", rewarded((4,), noise), 8000, flat_critic),
-        ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, one_action),
-        ("deterministic_too_early", "min_std", rewarded((4,), action_space=BOX), 640, narrow),
-        ("cut_episodes", "n_episodes", rewarded((3, 7)), 100, {"n_steps": 10, "baseline": "mean"}),
-    ],
-)
+TASKS = [
+    ("rate_too_large", "Lower learning_rate (now 1)", "CartPole-v1", 2000, {"learning_rate": 1.0}),
+    ("unscaled_returns", "VecNormalize", rewarded((5,), lambda t, action: 5e3), 64, {}),
+    ("too_few_episodes", "n_episodes", rewarded((4,), noise), 400, whole),
+    ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
+    ("total_return", "reward_to_go=True", rewarded((4,)), 64, {**whole, "n_episodes": 4, "reward_to_go": False}),
+    ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
+    ("useless_critic", "n_critic_updates", rewarded((4,), noise), 8000, flat_critic),
+    ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, one_action),
+    ("deterministic_too_early", "min_std", rewarded((4,), action_space=BOX), 640, narrow),
+    ("cut_episodes", "n_episodes", rewarded((3, 7)), 100, {"n_steps": 10, "baseline": "mean"}),
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "env", "timesteps", "kwargs"), TASKS)
 def test_a_task_made_for_it_falls_into_the_pitfall(name, argument, env, timesteps, kwargs):
     assert argument in fall(env, timesteps, **kwargs)[name]
 
 
 def test_every_pitfall_has_a_task():
-    tested = {case[0] for case in test_a_task_made_for_it_falls_into_the_pitfall.pytestmark[0].args[1]}
-    assert tested == set(PITFALLS)
+    assert {case[0] for case in TASKS} == set(PITFALLS)
 
 
 HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
 HEALTHY |= dict(n_episodes=16, n_steps=256, used_fraction=1.0)
 
 
-def seen(*updates, n=1, progress=1.0, signal=0.0, **kwargs):
+def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, **kwargs):
     """What ``history`` makes a history of: n times these updates, of a model with these arguments."""
-    return updates * n, progress, signal, kwargs
+    return updates * n, progress, signal, n_updates, kwargs
 
 
-def history(updates, progress, signal, kwargs):
+def history(updates, progress, signal, n_updates, kwargs):
     """Updates that are healthy but for the figures given, whose gradients have a signal-to-noise ratio."""
     model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", **kwargs)
     gradients = th.randn(len(updates), 30, generator=th.Generator().manual_seed(0)) + signal**0.5
     made = [Update(gradient=g, **{**HEALTHY, **figures}) for g, figures in zip(gradients, updates, strict=True)]
-    return History(model, made, 100, progress)
+    return History(model, made, n_updates, progress)
 
 
 few = {"n_episodes": 4}
-large = {"return_scale": 2e3}
+large = {"return_scale": 1001.0}
 spread = {"randomness": 1.0}
 peaked = {"randomness": 0.3}
 fixed = {"randomness": 0.01}
-spike = {"grad_norm": 11.0}
-unexplained = {"explained_variance": -0.1, "return_std": 1.1}
+spike = {"grad_norm": 10.1}
+unexplained = {"explained_variance": 0.0, "return_std": 1.1}
+late = {"progress": 0.49}
 constant_returns = {"explained_variance": -0.1, "return_std": 0.9}
 cut = {"n_steps": 32, "baseline": "mean"}
+free = {"max_grad_norm": None}
 
 
 @pytest.mark.parametrize(
     ("name", "falls", "stays"),
     [
-        ("rate_too_large", seen({"kl": 0.2}, n=10), seen({"kl": 0.2}, n=9)),
-        ("rate_too_large", seen({}, {"kl": 1.5}), seen({"kl": 1.5}, {})),
+        ("rate_too_large", seen({"kl": 0.11}, n=10), seen({"kl": 0.11}, n=9)),
+        ("rate_too_large", seen({"kl": 0.11}, n=10), seen({"kl": 0.09}, n=10)),
+        ("rate_too_large", seen({}, {"kl": 1.1}), seen({"kl": 1.1}, {})),
+        ("rate_too_large", seen({}, {"kl": 1.1}), seen({}, {"kl": 0.9})),
+        ("rate_too_large", seen(spread, {"randomness": 0.49}), seen(spread, {"randomness": 0.51})),
         ("rate_too_large", seen(spread, *[peaked] * 9), seen(spread, *[peaked] * 10)),
+        ("unscaled_returns", seen(large), seen({"return_scale": 999.0})),
         ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
         ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
         ("too_few_episodes", seen(few, n=50), seen(few, n=50, signal=0.3)),
-        ("too_few_episodes", seen({"n_steps": 20}, n=50), seen({}, n=50)),
+        ("too_few_episodes", seen({"n_episodes": 7}, n=50), seen({"n_episodes": 8}, n=50)),
+        ("too_few_episodes", seen({"n_steps": 63}, n=50), seen({"n_steps": 64}, n=50)),
         ("too_few_episodes", seen(few, n=50), seen(few, n=49)),
-        ("spikes_without_clipping", seen(*[{}] * 20, spike, max_grad_norm=None), seen(*[{}] * 20, spike)),
-        ("useless_critic", seen(unexplained, n=50, progress=0.4), seen(unexplained, n=50, progress=0.6)),
-        ("useless_critic", seen(unexplained, n=50, progress=0.4), seen(constant_returns, n=50, progress=0.4)),
-        ("deterministic_too_early", seen(fixed, progress=0.6), seen(fixed, progress=0.5)),
+        ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 19, {"grad_norm": 9.9}, **free)),
+        ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 18, spike, **free)),
+        ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 19, spike)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen(unexplained, n=25, progress=0.5)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen(unexplained, n=24, **late)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen(unexplained, n=25, n_updates=99, **late)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen({"explained_variance": 0.01}, n=25, **late)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen(constant_returns, n=25, **late)),
+        ("deterministic_too_early", seen(fixed, progress=0.51), seen(fixed, progress=0.5)),
+        ("deterministic_too_early", seen({"randomness": 0.049}), seen({"randomness": 0.051})),
         ("cut_episodes", seen({"used_fraction": 0.89}, **cut), seen({"used_fraction": 0.91}, **cut)),
         ("cut_episodes", seen({"used_fraction": 0.5}, **cut), seen({"used_fraction": 0.5}, n_steps=32)),
     ],
@@ -137,7 +149,7 @@ def test_a_pitfall_starts_at_its_threshold(name, falls, stays):
     ("name", "case"), [("rate_too_large", seen({"kl": 1.5})), ("deterministic_too_early", seen(fixed))]
 )
 def test_the_natural_step_is_shortened_by_its_target(name, case):
-    sentence = PITFALLS[name](history(*case[:3], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
+    sentence = PITFALLS[name](history(*case[:4], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
     assert "ower target_kl" in sentence and "learning_rate" not in sentence
 
 

@@ -33,13 +33,20 @@ def train(callback, timesteps=512, model=None, **kwargs):
     return model.learn(timesteps, callback), model.logger.history
 
 
+def actor_of(model):
+    """The actor's parameters, shape ``(n,)``."""
+    return th.cat([p.detach().flatten() for name, p in model.policy.named_parameters() if "value_net" not in name])
+
+
 def test_it_logs_every_so_many_rollouts():
-    _, history = train(GradientQualityCallback(2, ("mean", "value")))
+    thetas = Record(actor_of, "rollout_start")
+    _, history = train([thetas, GradientQualityCallback(2, ("mean", "value"))])
     variances = {f"gradient/variance/{name}" for name in ("none", "mean", "value")}
     assert set(history) == variances | {"gradient/snr", "gradient/noise_scale", "gradient/cosine"}
     assert len(history["gradient/snr"]) == 2
-    assert len(history["gradient/cosine"]) == 1
-    assert -1 <= history["gradient/cosine"][0] <= 1
+    # Of the last two updates before the fourth rollout
+    before, after = th.stack(thetas.records[1:4]).diff(dim=0)
+    assert history["gradient/cosine"] == [pytest.approx(float(th.cosine_similarity(before, after, dim=0)), abs=1e-5)]
 
 
 def test_episodes_of_one_start_are_not_taken_for_independent():
@@ -79,10 +86,25 @@ def test_no_more_episodes_than_allowed_are_used():
         given.append(rollout)
         return rollout.returns * 0
 
-    model, _ = train(GradientQualityCallback(1, [counted], max_episodes=5), 1, baseline="none", n_episodes=12)
-    assert len(th.unique(given[0].episodes[given[0].used])) == 5
-    assert given[0].used.sum() < model.rollout.used.sum()
+    callback = GradientQualityCallback(1, [counted], max_episodes=5)
+    model, history = train(callback, 1, baseline="none", n_episodes=12, learning_rate=0.0)
+    used = given[0]
+    assert used.used_episodes.tolist() == model.rollout.used_episodes[[0, 3, 6, 8, 11]].tolist()
     assert evenly_spread(model.rollout, 12) is model.rollout
+    gradients = gradients_by_episode(used, used.returns)[0].double()
+    trace = float(gradients.var(0).sum())
+    signal = float(gradients.mean(0).square().sum()) - trace / 5
+    # Of the mean of all twelve episodes, as far as five know it
+    assert history["gradient/snr"] == [pytest.approx(12 * signal / trace, rel=1e-3)]
+
+
+def test_it_keeps_what_it_knows_from_one_learn_to_the_next():
+    callback = GradientQualityCallback(1)
+    model, history = train(callback, 64)
+    assert "gradient/cosine" not in history
+    # Two further rollouts
+    model.learn(256, callback, reset_num_timesteps=False)
+    assert len(model.logger.history["gradient/cosine"]) == 1
 
 
 @pytest.mark.parametrize("every", [1, 5])

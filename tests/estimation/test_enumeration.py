@@ -21,6 +21,7 @@ from enumeration import (
 )
 from environments import Tree
 
+from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.baselines import score_products
 
 
@@ -123,8 +124,11 @@ def test_dividing_by_steps_only_rescales_where_lengths_are_equal():
     assert_equal(2 * expected_gradient(model), gradient_of_return(model))
 
 
+@pytest.mark.parametrize("numbers_at_once", [baselines.CHUNK, 1])
 @pytest.mark.parametrize("reward_to_go", [False, True])
-def test_optimal_is_its_formula_on_the_other_episodes(reward_to_go):
+def test_optimal_is_its_formula_on_the_other_episodes(reward_to_go, numbers_at_once, monkeypatch):
+    """Also where the scores of one episode at a time fit into memory."""
+    monkeypatch.setattr(baselines, "CHUNK", numbers_at_once)
     model = make_model(ragged=True, baseline="optimal", reward_to_go=reward_to_go, n_episodes=3)
     for batch in product(Tree(ragged=True).trajectories(), repeat=3):
         _, ours = rollout_of(model, batch)

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.distributions import kl_divergence
@@ -49,10 +50,29 @@ def gradient_in_range(policy, obs):
     return th.autograd.grad(-(weights * log_probs).sum(), policy.action_net.weight)
 
 
+def test_a_system_is_solved_in_ten_iterations_of_conjugate_gradients():
+    """x minimizes the error over the Krylov space of dimension ten, to which the residual is orthogonal."""
+    a = th.diag(th.linspace(1, 4, 12, dtype=th.float64))
+    b = th.linspace(-1, 2, 12, dtype=th.float64)
+    x = conjugate_gradients(lambda v: a @ v, b)
+    krylov = th.linalg.qr(th.stack([th.linalg.matrix_power(a, i) @ b for i in range(10)], dim=1)).Q
+    residual = b - a @ x
+    assert (krylov.T @ residual).norm() < 1e-8 * b.norm() and (x - krylov @ (krylov.T @ x)).norm() < 1e-8 * x.norm()
+    assert residual.norm() > 1e-7 * b.norm()
+
+
+@pytest.mark.parametrize(("excess", "length"), [(1.19, 2.0), (1.21, 2.0 / 1.21**0.5)])
+def test_a_step_beyond_one_fifth_more_than_the_target_is_shortened(excess, length):
+    parameter = th.nn.Parameter(th.zeros(1, dtype=th.float64))
+    kl = line_search([parameter], th.ones(1), 2.0, lambda: excess * 0.01 * (parameter / 2) ** 2, 0.01)
+    assert parameter.item() == pytest.approx(-length)
+    assert kl == pytest.approx(excess * 0.01 if length == 2 else 0.01)
+
+
 @pytest.mark.parametrize("damping", [0.0, 0.1])
 def test_the_direction_is_the_gradient_times_the_inverse_fisher_information(damping, monkeypatch):
-    assert natural.DAMPING == 0.1
-    monkeypatch.setattr(natural, "DAMPING", damping)
+    if damping == 0:
+        monkeypatch.setattr(natural, "DAMPING", 0.0)
     policy = make_model().policy
     weight = policy.action_net.weight
     gradients = gradient_in_range(policy, OBS)
@@ -251,15 +271,36 @@ class Rescaled(ActorCriticPolicy):
         return values, log_prob * self.scale, entropy
 
 
+class Dropping(FlattenExtractor):
+    """Features of which half are dropped in training mode."""
+
+    def forward(self, observations):
+        return th.nn.functional.dropout(super().forward(observations), training=self.training)
+
+
+class Normalized(FlattenExtractor):
+    """Features that are normalized by their batch in training mode."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.norm(super().forward(observations))
+
+
 @pytest.mark.parametrize(
-    ("policy", "sentence"),
+    ("policy", "extractor", "sentence"),
     [
-        (Scaled, "get_distribution of Scaled does not give the log π"),
-        (Rescaled, "get_distribution does not depend on all"),
+        (Scaled, FlattenExtractor, "get_distribution of Scaled does not give the log π"),
+        (Rescaled, FlattenExtractor, "get_distribution does not depend on all"),
+        ("MlpPolicy", Dropping, "does not give the log π that it learns from .dropout"),
+        ("MlpPolicy", Normalized, "does not give the log π that it learns from .dropout, batch normalization"),
     ],
 )
-def test_a_policy_with_another_distribution_is_refused(policy, sentence):
-    model = REINFORCE(policy, "CartPole-v1", step="natural", n_steps=32, seed=0)
+def test_a_policy_with_another_distribution_is_refused(policy, extractor, sentence):
+    policy_kwargs = {"features_extractor_class": extractor}
+    model = REINFORCE(policy, "CartPole-v1", step="natural", n_steps=32, policy_kwargs=policy_kwargs, seed=0)
     before = to_vector(model.policy.parameters())
     with pytest.raises(ValueError, match=sentence):
         model.learn(32)

@@ -96,3 +96,9 @@ def test_a_policy_moves_to_another_algorithm_and_back(algorithm: type[OnPolicyAl
     other.learn(1)
     model.set_parameters(other.get_parameters(), exact_match=False)
     assert all(map(th.equal, other.policy.parameters(), model.policy.parameters()))
+
+
+@pytest.mark.parametrize("ortho_init", [True, False])
+def test_the_bias_of_a_linear_policy_is_0(ortho_init: bool) -> None:
+    policy = make(LinearPolicy, ortho_init=ortho_init)
+    assert not policy.action_net.bias.any() and not policy.action_net.bias.requires_grad

@@ -122,10 +122,11 @@ def test_sigterm_ends_the_processes_too(tmp_path):
     arguments = ["--tasks", "CartPole-v1", "--algorithms", "reinforce", "--timesteps", "10000000", "--processes", "1"]
     arguments += ["--output", str(output)]
     script = subprocess.Popen([sys.executable, BENCHMARKS / "compare.py", *arguments], start_new_session=True)
-    while not output.exists():
+    children = Path(f"/proc/{script.pid}/task/{script.pid}/children")
+    deadline = time.monotonic() + 60
+    while not (output.exists() and children.read_text()):
+        assert script.poll() is None and time.monotonic() < deadline
         time.sleep(0.1)
-    # Time for the pool to start
-    time.sleep(2)
     script.terminate()
     script.wait(60)
     deadline = time.monotonic() + 30
