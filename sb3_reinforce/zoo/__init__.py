@@ -18,7 +18,8 @@ except ImportError as error:
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_reinforce.zoo import samplers
-from sb3_reinforce.zoo.experiments import ALGORITHMS, HYPERPARAMS, Experiment, make_experiment
+from sb3_reinforce.zoo.experiments import HYPERPARAMS, Experiment, make_experiment
+from sb3_reinforce.zoo.settings import ALGORITHMS
 
 __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 

@@ -21,7 +21,7 @@ from rl_zoo3 import utils
 from sb3_reinforce.common.arguments import unknown_name
 from sb3_reinforce.common.processes import Processes, is_leader, rank_and_size
 from sb3_reinforce.zoo import ALGORITHMS
-from sb3_reinforce.zoo.experiments import ConfigurationError
+from sb3_reinforce.zoo.settings import ConfigurationError
 
 PLOTS = ("plot_train", "all_plots", "plot_from_file")
 # Modules of the Zoo without a function

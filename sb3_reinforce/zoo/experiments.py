@@ -1,55 +1,39 @@
-"""Experiments of the RL Zoo with the algorithms of this package: their settings are found, checked and converted."""
+"""Experiments of the RL Zoo with the algorithms of this package: their settings are found, fitted and converted."""
 
-import importlib
 import re
-import runpy
 from collections import OrderedDict
-from collections.abc import Iterator
 from pathlib import Path
 from pprint import pprint
-from typing import Any, get_args
+from typing import Any
 
 import gymnasium as gym
 import rl_zoo3
 import yaml
 from gymnasium import spaces
-from rl_zoo3 import exp_manager, utils
+from rl_zoo3 import exp_manager
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_reinforce.common.arguments import check_integer, check_number, own_arguments, unknown_name
-from sb3_reinforce.common.base import BasePolicyGradient
-from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.recurrent import RecurrentREINFORCE
-from sb3_reinforce.reinforce import REINFORCE
+from sb3_reinforce.zoo.settings import (
+    ALGORITHMS,
+    LINEAR,
+    PYTHON_KEYS,
+    TRAIN_ENV_KWARGS,
+    ZOO_ARGUMENTS,
+    ConfigurationError,
+    Settings,
+    allowed_keys,
+    as_dict,
+    check_hyperparams,
+    classes_of,
+    load_configuration,
+    scheduled_keys,
+)
 
-Settings = dict[str, Any]
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "reinforce": REINFORCE,
-    "reinforce_lstm": RecurrentREINFORCE,
-    "finite_difference": FiniteDifference,
-}
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-# The keys that the Zoo reads itself, and the arguments that it passes itself
-ZOO_KEYS = {
-    "n_timesteps", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack", "env_kwargs",
-    "monitor_kwargs",
-}  # fmt: skip
-ZOO_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device"}
-# In a configuration, a section by environment: the entries keep to the keys of the Zoo and the arguments of the
-# algorithm, so that other scripts can read them
-TRAIN_ENV_KWARGS = "train_env_kwargs"
-# Settings that name classes by their path
-CLASS_KEYS = ("policy", "env_wrapper", "vec_env_wrapper", "callback")
-# Settings whose dict may be given as a text
-PYTHON_KEYS = ("policy_kwargs", "monitor_kwargs", "normalize")
-LINEAR = re.compile(r"lin_([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
-
-
-class ConfigurationError(ValueError):
-    """A wrong setting, which the command line reports without a traceback."""
+# What takes the place of a policy for other observations
+FOR_DICTS = dict.fromkeys(("MlpPolicy", "CnnPolicy", "LinearPolicy"), "MultiInputPolicy")
+FOR_DICTS |= dict.fromkeys(("MlpLstmPolicy", "CnnLstmPolicy"), "MultiInputLstmPolicy")
 
 
 class Experiment(exp_manager.ExperimentManager):
@@ -152,18 +136,6 @@ def find_settings(experiment: Experiment) -> Settings:
     return fit_default(found, experiment) if key == "default" else found
 
 
-def load_configuration(config: str) -> Any:
-    """Load what a YAML file, a Python file or a module holds, as the Zoo does."""
-    try:
-        if config.endswith((".yml", ".yaml")):
-            return yaml.safe_load(Path(config).read_text())
-        if config.endswith(".py"):
-            return runpy.run_path(config)["hyperparams"]
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigurationError(f"{config} cannot be read: {error}") from error
-    return importlib.import_module(config).hyperparams
-
-
 def fit_default(default: Settings, experiment: Experiment) -> Settings:
     """Leave out the settings that do not go with the spaces of the environment, and use a policy that does."""
     given = {**default, **(experiment.custom_hyperparams or {})}
@@ -173,77 +145,20 @@ def fit_default(default: Settings, experiment: Experiment) -> Settings:
     env = wrap(env) if wrap else env
     env.close()
     fitted = dict(default)
-    space = env.observation_space
-    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    if not all(isinstance(part, spaces.Box) for part in parts):
+    if not can_be_normalized(env.observation_space, as_dict("normalize", default.get("normalize"))):
         fitted.pop("normalize", None)
     if isinstance(env.action_space, spaces.Box):
         fitted.pop("temperature", None)
-    if isinstance(space, spaces.Dict):
-        fitted["policy"] = "MultiInputLstmPolicy" if experiment.algo == "reinforce_lstm" else "MultiInputPolicy"
+    if isinstance(env.observation_space, spaces.Dict):
+        fitted["policy"] = FOR_DICTS.get(default["policy"], default["policy"])
     return fitted
 
 
-def allowed_keys(algorithm: str) -> set[str]:
-    """The keys that an algorithm's entry in a configuration may have."""
-    arguments = own_arguments(ALGORITHMS[algorithm], BasePolicyGradient)
-    return arguments.keys() - ZOO_ARGUMENTS | ZOO_KEYS | {TRAIN_ENV_KWARGS}
-
-
-def scheduled_keys(algorithm: str) -> set[str]:
-    """The arguments of an algorithm that may be schedules."""
-    arguments = own_arguments(ALGORITHMS[algorithm], BasePolicyGradient)
-    return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
-
-
-def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
-    """Raise an error for settings that the Zoo would fail on; the algorithm checks its own arguments."""
-    allowed = allowed_keys(algorithm)
-    for key in hyperparams:
-        if key not in allowed:
-            raise ConfigurationError(str(unknown_name(f"A setting of {algorithm}", "one of", sorted(allowed), key)))
-    for key in ("policy", "n_timesteps"):
-        if key not in hyperparams:
-            raise ConfigurationError(f"The settings of {algorithm} must hold {key}, which the Zoo reads even with -n")
-    if not isinstance(hyperparams["policy"], str):
-        raise ConfigurationError(f"policy must be a name, or the path of a class, got {hyperparams['policy']!r}")
-    for key, value in hyperparams.items():
-        if isinstance(value, str):
-            if re.fullmatch(r"[-+\d.]+e[-+\d]+", value, re.IGNORECASE):
-                raise ConfigurationError(f"{key} is the text {value!r}, as YAML reads it: write !!float {value}")
-            if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
-                raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
-    for key, path, _ in classes_of(hyperparams):
-        try:
-            utils.get_class_by_name(path)
-        except (AttributeError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"{key} must be the path of a class, got {path!r}: {error}") from error
-    for key in ("n_envs", "frame_stack"):
-        check_integer(key, hyperparams.get(key, 1), 1)
-    check_number("n_timesteps", hyperparams["n_timesteps"], 1)
-
-
-def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
-    """Each path of a class that the Zoo will import, with its setting before and its keyword arguments after it."""
-    for key in CLASS_KEYS:
-        given = hyperparams.get(key)
-        for each in given if isinstance(given, list) else [given]:
-            path, names = next(iter(each.items())) if isinstance(each, dict) and each else (each, {})
-            is_name = key == "policy" and "." not in str(path)
-            if names is None:
-                raise ConfigurationError(f"The arguments of {path} in {key} must be a dict, got None")
-            if not (is_name or path is None or isinstance(path, BaseCallback if key == "callback" else type)):
-                yield key, path, as_dict(f"The arguments of {path} in {key}", names)
-
-
-def as_dict(key: str, value: Any) -> Settings:
-    """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
-    result = {} if value is None or (key == "normalize" and isinstance(value, bool)) else value
-    if isinstance(value, str) and key in PYTHON_KEYS:
-        try:
-            result = eval(value, dict(vars(exp_manager)))
-        except Exception as error:
-            raise ConfigurationError(f"{key} must be Python, but {value!r} raises {error!r}") from error
-    if not isinstance(result, dict):
-        raise ConfigurationError(f"{key} must be a dict, got {value!r}")
-    return result
+def can_be_normalized(space: spaces.Space[Any], normalize: Settings) -> bool:
+    """Whether ``VecNormalize`` takes the observations with these arguments."""
+    if not normalize.get("norm_obs", True):
+        return True
+    parts = [space]
+    if isinstance(space, spaces.Dict):
+        parts = [space.spaces.get(key, space) for key in normalize.get("norm_obs_keys") or space.spaces]
+    return all(isinstance(part, spaces.Box) for part in parts)

@@ -7,7 +7,7 @@ A trial stores the suggested values, such as a power of two; ``train --trial-id`
 import optuna
 from rl_zoo3.hyperparams_opt import convert_onpolicy_params
 
-from sb3_reinforce.zoo.experiments import Settings
+from sb3_reinforce.zoo.settings import Settings
 
 
 def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
@@ -27,7 +27,9 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
         sampled["max_grad_norm"] = trial.suggest_float("max_grad_norm", 0.3, 2.0)
     # Without a critic, an episode that fixed rollouts cut is left out
     if sampled["baseline"] != "value" or trial.suggest_categorical("whole_episodes", [False, True]):
-        sampled["n_episodes_pow"] = trial.suggest_int("n_episodes_pow", 2, 6)
+        # Environments without an episode would be stepped, and their steps not used
+        low = max(2, (n_envs - 1).bit_length())
+        sampled["n_episodes_pow"] = trial.suggest_int("n_episodes_pow", low, low + 4)
     else:
         low, high = (7, 11) if sampled["step"] == "natural" else (3, 9)
         sampled["n_steps_pow"] = trial.suggest_int("n_steps_pow", low, high)
@@ -45,6 +47,7 @@ def convert_reinforce(sampled_params: Settings) -> Settings:
     # Set in any case, since a configured value may not go with the sampled ones
     for name in ("n_steps", "n_episodes", "target_kl"):
         arguments.setdefault(name, None)
+    arguments |= {"reward_to_go": True, "episodes_per_start": 1}
     if "n_episodes_pow" in arguments:
         arguments["n_episodes"] = 2 ** arguments.pop("n_episodes_pow")
     return arguments

@@ -13,8 +13,10 @@ import yaml
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from sb3_contrib.common.wrappers import ActionMasker
 from zoo_commands import RUN, config_of, message_of, train, zoo
 
+from sb3_reinforce import ActionMaskObservation
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
 SCHEDULED = {
@@ -180,11 +182,15 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
     for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
         settings = published.get(entry, published["default"])
         fixed = {key: settings[key] for key in ("policy", "estimator", "n_top") if key in settings}
+        if name != "finite_difference":
+            # Settings that a user may have configured
+            fixed |= {"reward_to_go": False, "episodes_per_start": 4}
         for _ in range(20):
             trial = study.ask()
             sample = HYPERPARAMS_SAMPLER[name](trial, 1, 8, {})
             assert HYPERPARAMS_CONVERTER[name](trial.params) == sample
-            ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
+            model = ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
+            assert name == "finite_difference" or model.n_episodes is None or model.n_episodes >= 8
 
 
 ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
@@ -202,3 +208,27 @@ def test_every_entry_trains(name, env, tmp_path):
         pytest.importorskip("cv2")
     train(name, "-n", "1", "--eval-freq", "-1", "-f", str(tmp_path), env=env)
     assert (tmp_path / name / f"{env}_1" / f"{env}.zip").exists()
+
+
+KEPT = [
+    ({"policy": "sb3_reinforce.MaskedPolicy"}, "sb3_reinforce.MaskedPolicy"),
+    ({"policy": "MaskedPolicy"}, "MaskedPolicy"),
+    ({"normalize": "dict(norm_obs=False)"}, "MultiInputPolicy"),
+    ({"normalize": "dict(norm_obs_keys=['observation'])"}, "MultiInputPolicy"),
+    ({"normalize": "dict(norm_obs_keys=['action_mask'])"}, "MultiInputPolicy"),
+    ({"normalize": True}, "MultiInputPolicy"),
+]
+
+
+@pytest.mark.parametrize(("settings", "policy"), KEPT)
+def test_a_default_keeps_what_goes_with_masks(settings, policy, tmp_path, monkeypatch):
+    def masked():
+        return ActionMaskObservation(ActionMasker(gym.make("CartPole-v1"), lambda env: np.ones(2, dtype=bool)))
+
+    monkeypatch.setitem(gym.registry, "Masked-v0", gym.envs.registration.EnvSpec("Masked-v0", masked))
+    default = {"policy": "MlpPolicy", "n_timesteps": 32, **settings}
+    train("reinforce", *conf(tmp_path, default=default), env="Masked-v0")
+    config = config_of(tmp_path / "reinforce" / "Masked-v0_1")
+    assert config["policy"] == policy
+    is_possible = settings.get("normalize") not in (True, "dict(norm_obs_keys=['action_mask'])")
+    assert config.get("normalize") == (settings.get("normalize") if is_possible else None)
