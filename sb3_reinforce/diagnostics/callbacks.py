@@ -4,14 +4,13 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.common.tensors import select, take, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
@@ -20,7 +19,7 @@ from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import log_prob_of, temperature_of, trainable
+from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
 
 
 class Diagnosis(BaseCallback):
@@ -156,8 +155,8 @@ class PitfallCallback(Diagnosis):
 
     The pitfalls: a learning rate that is too large, returns that are not scaled, too few episodes, the total return,
     gradients that spike without clipping, a critic that explains nothing, a policy that is deterministic too early, and
-    episodes that are cut. They are detected from what training computes anyway; the cost is two forward passes and a
-    backward pass over at most 256 steps of a rollout. Training is not changed.
+    episodes that are cut. They are detected from what training computes anyway; the cost is a forward and a backward
+    pass of the actor over each rollout, and a forward pass over at most 256 steps. Training is not changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
 
@@ -165,7 +164,7 @@ class PitfallCallback(Diagnosis):
     :raises TypeError: If the model is not a REINFORCE
     """
 
-    # Steps that are looked at, and components of a gradient that are kept
+    # Steps at which the randomness is measured, and components of a gradient that are kept
     N_STEPS = 256
     N_COMPONENTS = 10_000
 
@@ -187,15 +186,16 @@ class PitfallCallback(Diagnosis):
         rollout: Rollout = self.model.rollout
         self.rollout = rollout
         policy = rollout.policy
-        is_first = rollout.used & (rollout.used.flatten().cumsum(0).view_as(rollout.used) <= self.N_STEPS)
-        self.obs, actions = used_inputs(replace(rollout, used=is_first))
+        obs, actions = used_inputs(rollout)
+        self.obs = take(obs, th.arange(min(len(actions), self.N_STEPS)))
         self.temperature = temperature_of(policy)
-        log_prob = log_prob_of(policy, self.obs, actions)
+        log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)
         if log_prob.requires_grad:
-            weights = select(training_weights(self.model), is_first).to(log_prob)
+            weights = select(training_weights(self.model), rollout.used).to(log_prob)
             gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), trainable(policy), allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
+        leave_no_graph(policy, self.obs, actions[: self.N_STEPS])
 
     def _on_rollout_start(self) -> None:
         self._examine()

@@ -261,3 +261,16 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
         pytest.importorskip("Box2D")
     # With the default four passes and γ = 0.99 the critic of some seeds explains nothing for most of the run
     assert healthy("LunarLander-v3", 150_000, gamma=0.999, n_critic_updates=10, batch_size=64) == ({}, 0)
+
+
+@pytest.mark.parametrize("rollout", [{"n_steps": 300}, {"n_episodes": 3, "baseline": "none"}])
+def test_the_gradient_is_that_of_all_steps(rollout):
+    """Its signal-to-noise ratio would be smaller for a part of a long rollout."""
+    env = make_vec_env(lambda: Corridor((200,), lambda t, action: float(action)), 2, seed=0)
+    kwargs = {"policy_kwargs": {"net_arch": [4]}, "seed": 0, "device": "cpu", **rollout}
+    model = REINFORCE("MlpPolicy", env, learning_rate=0.0, max_grad_norm=None, **kwargs)
+    callback = PitfallCallback()
+    model.learn(1, callback)
+    assert model.rollout.used.sum() > 2 * callback.N_STEPS
+    norm = float(callback.gradient.norm()) / model.rollout.denominator
+    assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-4)
