@@ -12,6 +12,7 @@ from sb3_reinforce.diagnostics.policy_errors import (
     largest_difference,
     log_prob_error,
     relative_difference,
+    sampling_error,
     score_error,
     sign_error,
     spread,
@@ -30,6 +31,7 @@ from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 # By check: the largest error that passes, and what the error compares
 CHECKS = {
     "log_prob": (1e-4, "log π(a|s) when drawn and when evaluated"),
+    "sampling": (5.0, "mean of −log π(a|s) over sampled actions and the entropy, in standard errors"),
     "scores": (0.02, "∇ log π by autograd and by finite differences"),
     "sign": (0.0, "fraction of sampled actions that a step along their own score makes less likely"),
     "returns": (1e-4, "G_t and its definition from the rewards"),
@@ -76,6 +78,7 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     Check the chain from the environment to the gradient, on whole episodes that the model itself collects.
 
     - ``log_prob``: the log π that training differentiates is the log π of the sampled actions.
+    - ``sampling``: actions are sampled with these probabilities, as far as their mean log π shows it.
     - ``scores``: its gradient by autograd equals its gradient by finite differences.
     - ``sign``: after a step along the score of an action, the policy samples it more often, or samples closer to it.
       ``log_std`` is left out. A policy that always samples the same action, or learns nothing else than ``log_std``,
@@ -130,6 +133,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
         difference = log_prob_error(policy, some_obs)
     return {
         "log_prob": difference,
+        "sampling": sampling_error(policy, obs, len(actions)),
         "scores": score_error(policy, some_obs, some_actions),
         "sign": sign_error(policy, obs, len(actions)),
         "returns": return_error(collector, rollout),

@@ -14,7 +14,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
-from sb3_reinforce.policies.evaluation import Parameters, log_prob_of, trainable
+from sb3_reinforce.policies.evaluation import Parameters, evaluate, log_prob_of, route_of, trainable
 from sb3_reinforce.policies.parameters import write
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
@@ -169,6 +169,37 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
             if after != before:
                 wrong.append(bool(after < before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
+
+
+@th.no_grad()
+def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
+    """
+    The difference between the mean of −log π over sampled actions and the entropy, in standard errors.
+
+    The actions are sampled at a few of the ``n_obs`` observations; the largest difference counts, or their sum. An
+    entropy without closed form is estimated from them, and then there is no difference.
+    """
+    n_draws = max(256, min(1024, n_at_once(policy)))
+    found = []
+    for index in th.randperm(n_obs)[:N_ACTIONS]:
+        one = take(obs, index[None])
+        many = take(one, th.zeros(n_draws, dtype=th.long))
+        many = without_memory(many) if isinstance(policy, RecurrentPolicy) else many
+        log_prob, entropy, _ = evaluate(policy, route_of(policy), many, draw(policy, one, n_draws), with_values=False)
+        differences = (-log_prob - entropy).double().cpu()
+        # Those of equal probabilities are rounding errors
+        if differences.std() > 1e-6:
+            found.append(differences)
+    if not found:
+        return 0.0
+    each = th.stack(found)
+    errors = standard_errors(each), standard_errors(each.sum(0))
+    return max(float(error.max()) for error in errors)
+
+
+def standard_errors(samples: th.Tensor) -> th.Tensor:
+    """``|mean| / (std / √n)`` of n samples ``(..., n)``."""
+    return samples.mean(-1).abs() * math.sqrt(samples.shape[-1]) / samples.std(-1)
 
 
 @th.no_grad()

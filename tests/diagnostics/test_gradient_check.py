@@ -33,7 +33,7 @@ def test_every_action_space_passes(action_space, kwargs):
     env = make_vec_env(lambda: corridor(action_space), 2, seed=0)
     table = check_gradient(REINFORCE("MlpPolicy", env, device="cpu", seed=0, gamma=0.9, **kwargs))
     assert table.passed, table
-    assert table.names == ["log_prob", "scores", "sign", "returns", "weights", "surrogate"]
+    assert table.names == ["log_prob", "sampling", "scores", "sign", "returns", "weights", "surrogate"]
 
 
 @pytest.mark.parametrize("baseline", ["leave_one_out", "time_mean", "mean"])

@@ -116,9 +116,9 @@ def failures(algorithm=REINFORCE, policy="MlpPolicy"):
 @pytest.mark.parametrize(
     ("wrong", "lines"),
     [
-        ({"policy": NEGATED}, ["log_prob", "sign"]),
-        ({"policy": SHIFTED}, ["log_prob", "sign"]),
-        ({"policy": OFFSET}, ["log_prob"]),
+        ({"policy": NEGATED}, ["log_prob", "sampling", "sign"]),
+        ({"policy": SHIFTED}, ["log_prob", "sampling", "sign"]),
+        ({"policy": OFFSET}, ["log_prob", "sampling"]),
         ({"policy": HalfDetached}, ["scores"]),
         ({"algorithm": WrongReturns}, ["returns", "weights"]),
         ({"algorithm": WrongWeights}, ["weights"]),
@@ -152,6 +152,31 @@ class Mirrored(ActorCriticPolicy):
 @pytest.mark.parametrize("log_std_init", [-3.0, 0.0, 2.0, 4.0])
 def test_a_wrong_sign_is_seen_with_little_and_with_much_noise(log_std_init, policy):
     assert check_gradient(with_noise(log_std_init, policy, n_actions=2))["sign"].error == 1
+
+
+class Greedy(ActorCriticPolicy):
+    """Takes a uniform action in 30 % of the states, and reports log π of the network."""
+
+    def forward(self, obs, deterministic=False):
+        actions, values, _ = super().forward(obs, deterministic)
+        uniform = th.randint_like(actions, self.action_space.n)
+        actions = th.where(th.rand(len(actions)) < 0.3, uniform, actions)
+        return actions, values, self.evaluate_actions(obs, actions)[1]
+
+
+class Warm(ActorCriticPolicy):
+    """Samples with twice the standard deviation that it reports."""
+
+    def forward(self, obs, deterministic=False):
+        mean, values = self.get_distribution(obs).distribution.mean, self.predict_values(obs)
+        actions = mean + 2 * self.log_std.exp() * th.randn_like(mean)
+        return actions, values, self.evaluate_actions(obs, actions)[1]
+
+
+def test_actions_that_are_sampled_with_other_probabilities_are_seen():
+    assert failures(policy=Greedy) == ["sampling"]
+    model = REINFORCE(Warm, corridor(spaces.Box(-1, 1, (2,))), baseline="mean", device="cpu", seed=0)
+    assert "sampling" in check_gradient(model).failures
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])
