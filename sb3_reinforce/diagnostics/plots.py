@@ -1,11 +1,10 @@
 """
-Figures of what ``diagnostics`` measures; they need matplotlib: ``pip install "sb3-reinforce[plots]"``.
+Figures of what ``diagnostics`` measures; they need the extra ``plots``: ``pip install "sb3-reinforce[plots]"``.
 
 Each function draws on the given Axes, or on new ones, and returns them: ``ax.figure.savefig(...)`` needs no display.
 """
 
 from collections.abc import Mapping
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +13,10 @@ try:
     import matplotlib.pyplot as plt
     from matplotlib.axes import Axes
     from matplotlib.ticker import NullLocator
+    from scipy.stats import t as student_t
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "sb3_reinforce.diagnostics.plots needs matplotlib: pip install 'sb3-reinforce[plots]'"
+        f"sb3_reinforce.diagnostics.plots needs {error.name}: pip install 'sb3-reinforce[plots]'"
     ) from error
 
 from sb3_reinforce.common.arguments import check_integer, check_kind, check_number
@@ -159,7 +159,8 @@ def plot_variances(
     """
     Plot the variance of the gradient estimate against its number of episodes, for each of several baselines.
 
-    A point is the mean over repetitions, with its normal interval. Points are shifted sideways, so that none is hidden.
+    A point is the mean over repetitions, with its interval of Student's t. Points are shifted sideways, so that none is
+    hidden.
 
     :param curves: By name, variances of shape ``(n_repetitions, n_points)``
     :param n_episodes: Episodes of the points, shape ``(n_points,)``
@@ -171,8 +172,7 @@ def plot_variances(
     """
     x = np.asarray(n_episodes, dtype=float)
     if check_number("confidence", confidence, 0, 1) == 1:
-        raise ValueError("confidence must be below 1 for the intervals of a normal distribution, got 1")
-    width = NormalDist().inv_cdf((1 + confidence) / 2)
+        raise ValueError("confidence must be below 1, where an interval is finite, got 1")
     given = arrays_of("curves", curves)
     for name, variances in given.items():
         if variances.ndim != 2 or len(variances) < 2 or variances.shape[1:] != x.shape:
@@ -182,6 +182,8 @@ def plot_variances(
             )
     ax = new_axes(ax)
     for index, (name, variances) in enumerate(given.items()):
+        # The interval of Student's t, since the deviation is estimated too
+        width = student_t.ppf((1 + confidence) / 2, len(variances) - 1)
         error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
         shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
         colour = COLOURS[index % len(COLOURS)]

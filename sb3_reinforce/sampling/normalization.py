@@ -75,6 +75,19 @@ def check_scale(env: VecEnv | None) -> None:
 
 
 @contextmanager
+def unclipped(env: VecEnv | None) -> Iterator[None]:
+    """Let no VecNormalize clip rewards in the block, so that their sums are multiples of the utility."""
+    before = [(each, each.clip_reward) for each in normalizers(env)]
+    try:
+        for each, _ in before:
+            each.clip_reward = np.inf
+        yield
+    finally:
+        for each, bound in before:
+            each.clip_reward = bound
+
+
+@contextmanager
 def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
     """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""
     observed = [ObservationStatistics(each) for each in normalizers(env) if each.training]

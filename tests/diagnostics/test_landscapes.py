@@ -11,7 +11,7 @@ from enumeration import make_model, true_gradient
 from environments import Corridor, Scales, Tree
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, estimator_comparison, landscape, plots
@@ -223,7 +223,8 @@ def test_every_picture_can_be_saved(tmp_path):
     variances = np.random.rand(3, 4) + 1
     ax = plots.plot_variances({"none": variances}, [2, 4, 8, 16])
     (bars,) = ax.collections
-    middle, half = variances.mean(0), 1.959964 * variances.std(0, ddof=1) / 3**0.5
+    # The quantile of Student's t for two degrees of freedom
+    middle, half = variances.mean(0), 4.302653 * variances.std(0, ddof=1) / 3**0.5
     drawn_bars = np.array([segment[:, 1] for segment in bars.get_segments()])
     np.testing.assert_allclose(drawn_bars, np.stack([middle - half, middle + half], axis=1), rtol=1e-6)
     save(ax, tmp_path / "variances.png")
@@ -303,3 +304,17 @@ def test_the_utility_of_a_policy_with_gsde_has_new_noise_in_each_step():
         utility = CandidateUtility(model, 2000, seed=0)
         assert abs(float(utility(utility.theta[None]))) < 4.5 / 2000**0.5
         assert model.policy.action_dist.exploration_matrices is matrices
+
+
+def test_the_likelihood_ratio_is_of_rewards_that_are_not_clipped():
+    """As the utilities of finite differences are; the scale of a new VecNormalize is 1."""
+    gradients = []
+    for bound in (0.5, 10.0):
+        env = VecNormalize(make_vec_env(lambda: Corridor((2,), lambda t, action: 3.0 * action), 2, seed=0))
+        env.clip_reward = bound
+        model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+        th.manual_seed(0)
+        gradients.append(likelihood_ratio(model, 50)[0])
+        assert env.clip_reward == bound
+    assert gradients[0].any()
+    th.testing.assert_close(*gradients)
