@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -241,5 +242,8 @@ def check_learn(env: Any, *arguments: Any) -> None:
     """Check the arguments of ``learn``, in their order."""
     if env is None:
         raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
+    if th.get_default_device().type != "cpu":
+        default = th.get_default_device()
+        raise ValueError(f"PyTorch's default device must be the CPU, got {default}: give the model device=... instead")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

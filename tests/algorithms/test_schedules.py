@@ -143,3 +143,11 @@ def test_a_policy_that_is_saved_alone_has_no_temperature(tmp_path):
     with th.no_grad():
         own = model.policy.get_distribution(obs).distribution
     th.testing.assert_close(own.probs, (alone.logits / 0.25).softmax(-1).detach())
+
+
+def test_a_schedule_may_end_below_zero_by_rounding():
+    """LinearSchedule(0.1, 0, 0.4) is −1.4e-17 after two fifths of the training."""
+    schedule = LinearSchedule(0.1, 0.0, 0.4)
+    assert schedule(0.6) < 0
+    model = make("steps", ent_coef=schedule, learning_rate=schedule).learn(80)
+    assert model._scheduled("ent_coef") == 0 and model.num_timesteps == 80

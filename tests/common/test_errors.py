@@ -91,3 +91,10 @@ def test_a_critic_whose_passes_end_in_parameters_that_are_not_finite_keeps_those
     with pytest.raises(ValueError, match="made a parameter of the critic that is not finite"):
         model.learn(8)
     assert plain(model.policy.state_dict()) == before
+
+
+@all_kinds
+def test_another_default_device_is_refused(kind):
+    model = make(kind)
+    with th.device("meta"), pytest.raises(ValueError, match="default device must be the CPU, got meta"):
+        model.learn(8)
