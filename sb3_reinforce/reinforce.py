@@ -294,7 +294,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param env: The training environment
         :param callback: Called at each step, and at the beginning and end of the rollout
         :param rollout_buffer: Filled as by A2C: ``advantages`` is G_t − b_t, and ``returns`` what the critic is fitted
-            to, or without a critic G_t; both are 0 at steps that are not used
+            to, or without a critic G_t; both are 0 at steps that are not used. ``rewards`` do not include γ V at time
+            limits
         :param n_rollout_steps: Steps per environment, None for whole episodes
         :return: False if the callback stopped the collection; the rollout is then dropped
         :raises TypeError: If an argument of the model has been changed to a wrong type
@@ -309,7 +310,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.reset()
         n_steps = self.n_steps
         callback.on_rollout_start()
-        # The user or a callback may have changed arguments
+        # The user or a callback may have changed arguments and environments
+        env = cast(VecEnv, self.env)
         check_reinforce(self, BASELINES)
         check_starts(self)
         self._apply_temperature_and_floor()
@@ -461,7 +463,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if batch.values is not None:
+            last_gradients = [parameter.grad for parameter in actor]
             self._train_critic(route, batch, batch.values, critic, bool(shared), critic_rate)
+            # The critic's passes clear them, and a callback may log them
+            for parameter, gradient in zip(actor, last_gradients, strict=True):
+                parameter.grad = gradient
 
     def _step_policy(
         self, route: Route, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor

@@ -24,6 +24,7 @@ from sb3_reinforce.policies.evaluation import (
     Parameters,
     actor_parameters,
     extract_features,
+    leave_no_graph,
     log_prob_of,
     trainable,
 )
@@ -73,6 +74,7 @@ def gradients_by_episode(
         sums = sums_by_factors(rollout, parameters, layers, w, episode, chunk)
     for number, gradients in sums:
         result[:, number] += gradients[:, columns]
+    leave_no_graph(rollout.policy, *first_step(rollout))
     return result
 
 
@@ -131,9 +133,14 @@ def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
 def parameters_of(rollout: Rollout) -> Parameters:
     """``score_parameters`` of the policy that made a rollout, from its first step."""
+    return score_parameters(rollout.policy, *first_step(rollout))
+
+
+def first_step(rollout: Rollout) -> tuple[PyTorchObs, th.Tensor]:
+    """The first observation of a rollout, and the action of the policy."""
     first = th.arange(1)
     actions = as_policy_actions(take(flatten(rollout.actions), first), rollout.policy.action_space)
-    return score_parameters(rollout.policy, take(flatten(rollout.inputs), first), actions)
+    return take(flatten(rollout.inputs), first), actions
 
 
 def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:

@@ -115,6 +115,9 @@ def evaluate(
     values: th.Tensor | None = None
     if route.evaluate_actions:
         values, log_prob, entropy = policy.evaluate_actions(obs, actions)
+        if entropy is not None and entropy.dim() == 0:
+            # A user's method may return the mean, which is all that A2C takes of it
+            entropy = entropy.expand_as(log_prob)
     else:
         if route.actor is None:
             distribution = action_distribution(policy, obs)
@@ -135,6 +138,12 @@ def evaluate(
 def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
     """log π(a|s), shape ``(n,)``; the critic is evaluated only if a user's ``evaluate_actions`` does it."""
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
+
+
+@th.no_grad()
+def leave_no_graph(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> None:
+    """Evaluate a policy without a graph: it keeps its last distribution, which could not be deep-copied with one."""
+    log_prob_of(policy, obs, actions)
 
 
 def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:

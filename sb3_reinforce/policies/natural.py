@@ -61,6 +61,8 @@ def natural_step(
     if 0 < curvature < math.inf:
         kl = line_search(parameters, d, math.sqrt(2 * target_kl / curvature), divergence, target_kl)
     if kl is None:
+        # Leaves no graph in the policy, which could not be deep-copied with one
+        measured(divergence)
         warnings.warn(
             "The natural step is left out, and the parameters are those before it: no step was found that changes the "
             "policy by target_kl. Mostly the policy is almost deterministic; ent_coef, temperature or min_std may help",

@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import actor_parameters, log_prob_of
+from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph
 
 
 def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -28,9 +28,7 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     try:
         with th.enable_grad():
             parameters = actor_parameters(policy, obs, actions)
-        with th.no_grad():
-            # A policy keeps its last distribution, and with the graph in it could not be deep-copied
-            log_prob_of(policy, obs, actions)
+        leave_no_graph(policy, obs, actions)
     finally:
         policy.set_training_mode(training)
     log_std = getattr(policy, "log_std", None)

@@ -100,12 +100,13 @@ class MatrixActor:
         for stack, values in zip(self.stacks, parameters.split(thetas, self.searched), strict=True):
             stack[envs] = values
 
+    @th.no_grad()
     def act(self, obs: Any) -> np.ndarray:
         outputs = self.outputs(obs)
         if self.deterministic:
             actions = mode(outputs, self.policy.action_space)
         else:
-            actions = distribution_of(self.policy, outputs).sample().detach()
+            actions = distribution_of(self.policy, outputs).sample()
         shape: Any = self.policy.action_space.shape
         return self.as_env_actions(actions.cpu().numpy().reshape(-1, *shape))
 

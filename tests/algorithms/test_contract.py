@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from callbacks import Record
 from environments import Corridor, Random, Reused
 from gymnasium import spaces
 from models import KINDS, Scaled, all_kinds, make, moved_by_learning
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from sb3_reinforce import REINFORCE, reinforce
 from sb3_reinforce.common import settings
+from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback, compare_baselines, landscape
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 from sb3_reinforce.estimation import weights
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -202,3 +204,15 @@ def test_the_policy_can_be_pickled_and_copied():
     policy = make("steps", temperature=0.5, policy_kwargs=kwargs).learn(16).policy
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert all(map(th.equal, policy.parameters(), other.parameters()))
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+def test_the_policy_can_be_copied_where_a_callback_has_measured(env):
+    def copied(model):
+        th.nn.Module.zero_grad(copy.deepcopy(model.policy))
+
+    callbacks = [PitfallCallback(), GradientQualityCallback(1), Record(copied)]
+    model = make("episodes", env, baseline="optimal").learn(1, callbacks)
+    for measure in (compare_baselines, landscape):
+        measure(model, n_episodes=3)
+        copied(model)

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from models import Experts, all_kinds, make, moved_by_learning, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 
@@ -134,7 +135,7 @@ def test_a_critic_without_parameters():
     assert model._n_updates == 4 and (model.rollout_buffer.values == 0).all()
 
 
-@pytest.mark.parametrize(("n_critic_updates", "batch_size", "n_passes"), [(1, 64, 1), (3, 64, 3), (2, 5, 8)])
+@pytest.mark.parametrize(("n_critic_updates", "batch_size", "n_passes"), [(1, 64, 1), (3, 64, 3), (2, 5, 6), (2, 4, 8)])
 def test_one_policy_step_per_rollout_and_the_critics_in_minibatches(n_critic_updates, batch_size, n_passes):
     model = make("steps", n_steps=16, n_critic_updates=n_critic_updates, batch_size=batch_size)
     steps = {model.policy.optimizer: [], model.critic_optimizer: []}
@@ -142,3 +143,57 @@ def test_one_policy_step_per_rollout_and_the_critics_in_minibatches(n_critic_upd
         optimizer.register_step_pre_hook(lambda optimizer, *args: steps[optimizer].append(model.num_timesteps))
     model.learn(32)
     assert list(steps.values()) == [[16, 32], [16] * n_passes + [32] * n_passes]
+
+
+def test_a_callback_finds_the_gradients_of_the_last_update():
+    model = make("steps", seed=0, max_grad_norm=None)
+    norms = Record(lambda model: [p.grad is not None for p in model.policy.parameters()], "rollout_start")
+    model.learn(16, norms)
+    assert not any(norms.records[0]) and all(norms.records[1])
+    actor = [p.grad for name, p in model.policy.named_parameters() if "value_net" not in name]
+    norm = float(th.cat([gradient.flatten() for gradient in actor]).norm())
+    assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-5)
+
+
+class Normalized(FlattenExtractor):
+    """Features that are normalized by their batch."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.norm(super().forward(observations))
+
+
+def test_no_minibatch_of_the_critic_has_one_step():
+    kwargs = {"features_extractor_class": Normalized, "share_features_extractor": False, "net_arch": [4]}
+    make("steps", n_steps=9, batch_size=4, policy_kwargs=kwargs).learn(9)
+
+
+class MeanEntropy(ActorCriticPolicy):
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob, entropy.mean()
+
+
+class Entropies(ActorCriticPolicy):
+    def evaluate_actions(self, obs, actions):
+        return super().evaluate_actions(obs, actions)
+
+
+def test_a_policy_may_return_the_mean_entropy():
+    mean, each = (make("steps", policy=policy, ent_coef=5.0, seed=0).learn(8) for policy in (MeanEntropy, Entropies))
+    for parameter, other in zip(mean.policy.parameters(), each.policy.parameters(), strict=True):
+        th.testing.assert_close(parameter, other)
+
+
+@pytest.mark.parametrize("kind", ["steps", "episodes"])
+def test_environments_that_a_callback_sets_at_the_start_of_a_rollout_are_used_in_it(kind):
+    env, other = (make_vec_env(lambda length=length: Corridor((length, 9)), 2) for length in (2, 3))
+    model = make(kind, env)
+    lengths = Record(lambda model: model.env.get_attr("lengths")[0], "step")
+    switch = Record(lambda model: model.num_timesteps and model.env is env and model.set_env(other), "rollout_start")
+    model.learn(100, [switch, lengths])
+    assert other.envs[0].unwrapped.t > 0 or other.envs[0].unwrapped.length
+    assert model.num_timesteps >= 100 and lengths.records[-1] == (3, 9)
