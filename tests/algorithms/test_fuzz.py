@@ -1,5 +1,5 @@
 """
-Random configurations: a valid one trains, stays finite and counts exactly; an invalid one names an argument.
+Random configurations: each trains, stays finite and counts exactly.
 
 ``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand of each instead of a hundred.
 """
@@ -101,13 +101,47 @@ FINITE_DIFFERENCE_STRATEGIES = COMMON | {
 }
 
 
+# Arguments that go with a critic, with a kind of actions, or with a kind of step
+WITH_CRITIC = {"gae_lambda": floats(0, 1), "critic_learning_rate": st.one_of(st.none(), floats(0, 1))}
+OF_A_BOX = {"min_std": floats(0, 2), "use_sde": st.booleans(), "sde_sample_freq": st.integers(-1, 4)}
+OF_NUMBERS = {"temperature": st.one_of(floats(0.1, 10), st.just(lambda p: 0.5 * p))}
+OF_A_NATURAL_STEP = {"target_kl": st.one_of(st.none(), floats(0, 0.1), st.just(lambda p: 0.01 * p))}
+WITH_PAIRS = {"n_top": st.integers(1, 2)}
+# What other tests vary
+LEFT_OUT = {
+    "policy", "policy_kwargs", "device", "verbose", "tensorboard_log", "stats_window_size", "max_episode_steps",
+    "rollout_buffer_class", "rollout_buffer_kwargs", "episodes_per_start",
+}  # fmt: skip
+
+
+def test_every_argument_is_drawn_or_left_out():
+    own = REINFORCE_STRATEGIES | WITH_CRITIC | OF_A_BOX | OF_NUMBERS | OF_A_NATURAL_STEP
+    assert own.keys() | LEFT_OUT | {"step", "n_steps", "n_episodes"} == REINFORCE_ARGUMENTS.keys()
+    searched = FINITE_DIFFERENCE_STRATEGIES.keys() | WITH_PAIRS.keys() | {"n_delta"}
+    assert searched | LEFT_OUT >= FINITE_DIFFERENCE_ARGUMENTS.keys() >= searched
+
+
 @st.composite
-def reinforce_arguments(draw):
-    chosen = draw(st.fixed_dictionaries({}, optional=REINFORCE_STRATEGIES))
-    whole = draw(st.booleans())
+def reinforce_runs(draw):
+    env = draw(environments())
+    of_actions = OF_A_BOX if isinstance(env.action_space, spaces.Box) else OF_NUMBERS
+    chosen = draw(st.fixed_dictionaries({}, optional=REINFORCE_STRATEGIES | of_actions))
+    has_critic = chosen.get("baseline", "value") == "value"
+    if has_critic and chosen.get("reward_to_go", True):
+        chosen |= draw(st.fixed_dictionaries({}, optional=WITH_CRITIC))
+    if draw(st.booleans()):
+        chosen |= {"step": "natural", **draw(st.fixed_dictionaries({}, optional=OF_A_NATURAL_STEP))}
     # Without a critic some episode must end: the longest has 6 steps
-    n_steps = draw(st.integers(1, 9)) if chosen.get("baseline", "value") == "value" else draw(st.integers(6, 9))
-    return {**chosen, **({"n_episodes": draw(st.integers(2, 6))} if whole else {"n_steps": n_steps})}
+    n_steps = draw(st.integers(1, 9)) if has_critic else draw(st.integers(6, 9))
+    return env, {**chosen, **({"n_episodes": draw(st.integers(2, 6))} if draw(st.booleans()) else {"n_steps": n_steps})}
+
+
+@st.composite
+def searches(draw):
+    chosen = draw(st.fixed_dictionaries({"n_delta": st.integers(2, 5)}, optional=FINITE_DIFFERENCE_STRATEGIES))
+    if chosen.get("estimator") == "central":
+        chosen |= draw(st.fixed_dictionaries({}, optional=WITH_PAIRS))
+    return chosen
 
 
 def assert_trains(algorithm, env, arguments):
@@ -116,6 +150,7 @@ def assert_trains(algorithm, env, arguments):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Episodes that n_steps cuts are left out")
         warnings.filterwarnings("ignore", "n_delta=. perturbations do not determine")
+        warnings.filterwarnings("ignore", "The natural step is left out")
         model.learn(30, Counts())
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     assert model.num_timesteps == sum(env.get_attr("n_steps")) >= 30
@@ -132,12 +167,12 @@ def assert_trains(algorithm, env, arguments):
 
 
 @fuzzed
-@given(environments(), reinforce_arguments())
-def test_valid_reinforce(env, arguments):
-    assert_trains(REINFORCE, env, arguments)
+@given(reinforce_runs())
+def test_valid_reinforce(run):
+    assert_trains(REINFORCE, *run)
 
 
 @fuzzed
-@given(environments(), st.fixed_dictionaries({"n_delta": st.integers(2, 5)}, optional=FINITE_DIFFERENCE_STRATEGIES))
+@given(environments(), searches())
 def test_valid_search(env, arguments):
     assert_trains(FiniteDifference, env, arguments)
