@@ -52,12 +52,29 @@ def assert_trains(model):
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
-@all_kinds
-@pytest.mark.parametrize(("observation_space", "action_space", "policy"), SPACES, ids=str)
-def test_spaces(observation_space, action_space, policy, kind):
+def make_for_spaces(kind, env, policy):
+    """A small model of a kind, or with a memory."""
+    if kind != "recurrent":
+        return make(kind, env, policy, seed=0)
+    small = {"lstm_hidden_size": 4, "net_arch": [4]}
+    policy = policy.replace("Policy", "LstmPolicy")
+    return RecurrentREINFORCE(policy, env, n_episodes=2, policy_kwargs=small, seed=0, device="cpu")
+
+
+# A memory does not take MultiDiscrete observations
+SPACES_OF_KINDS = [
+    (kind, *case)
+    for kind in (*KINDS, "recurrent")
+    for case in SPACES
+    if kind != "recurrent" or not isinstance(case[0], spaces.MultiDiscrete)
+]
+
+
+@pytest.mark.parametrize(("kind", "observation_space", "action_space", "policy"), SPACES_OF_KINDS, ids=str)
+def test_spaces(kind, observation_space, action_space, policy):
     """In training and in ``predict``; the stored actions of discrete spaces count from 0."""
     env = make_vec_env(lambda: Random(observation_space, action_space), 2, seed=0)
-    model = make(kind, env, policy, seed=0)
+    model = make_for_spaces(kind, env, policy)
     assert_trains(model)
     assert kind == "search" or isinstance(action_space, spaces.Box) or model.rollout_buffer.actions.min() == 0
     actions, _ = model.predict(env.reset())
