@@ -74,8 +74,8 @@ class FiniteDifference(BasePolicyGradient):
         and perturbations of shape ``(k, n)`` that returns a gradient of shape ``(n,)``
     :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
         ``torch.Generator`` that returns a tensor of shape ``(k, n)``
-    :param n_delta: k, the perturbations per update. None: 2n, but at most 64; where this is less than 1.5 n,
-        n/2, but at most 64
+    :param n_delta: k, the perturbations per update. None: ``min(2n, 64)`` up to n = 42 and ``min(n / 2, 64)``
+        beyond, at least ``n_top``; differences along coordinates have ``min(n, 64)``
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
     :param n_eval_episodes: Episodes per candidate, whose utility is their mean return
@@ -181,11 +181,11 @@ class FiniteDifference(BasePolicyGradient):
 
     def _check_arguments(self) -> None:
         """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
+        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
-            self.n_delta = default_n_delta(n_parameters)
-        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
+            self.n_delta = max(default_n_delta(n_parameters, self.estimator, self.perturbation), self.n_top or 0)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""
@@ -246,7 +246,8 @@ class FiniteDifference(BasePolicyGradient):
         if self.estimator == "regression" and cast(int, self.n_delta) <= n:
             warnings.warn(
                 f"n_delta={self.n_delta} perturbations do not determine the gradient of {n} parameters and an "
-                "intercept: the regression returns the one of least norm. Raise n_delta, or search fewer parameters",
+                f"intercept: the regression returns the one of least norm. Set n_delta to {2 * n} or more, use "
+                "estimator='central', or search fewer parameters",
                 stacklevel=4,
             )
         callback.on_training_start(locals(), globals())

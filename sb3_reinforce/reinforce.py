@@ -309,9 +309,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         n_steps = self.n_steps
+        before = self.env
         callback.on_rollout_start()
-        # The user or a callback may have changed arguments and environments
-        env = cast(VecEnv, self.env)
+        if self.env is not before:
+            env = cast(VecEnv, self.env)
+        # The user or a callback may have changed arguments
         check_reinforce(self, BASELINES)
         check_starts(self)
         self._apply_temperature_and_floor()
@@ -536,8 +538,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, PyTorch's gradients are
-            turned off, or processes under torchrun have different arguments; and as in ``collect_rollouts`` and
-            ``train``
+            turned off, its default device is not the CPU, or processes under torchrun have different arguments; and as
+            in ``collect_rollouts`` and ``train``
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -167,7 +167,7 @@ class Distributed(BaseAlgorithm):
         try:
             self.adopt(*processes.receive())
             if self.num_timesteps == 0:
-                # Reset in the round: what VecNormalize observes before it would be lost, or scale candidates otherwise
+                # A reset within the round, in which a search has frozen VecNormalize: its candidates need one scale
                 self._last_obs = None
             while True:
                 self.collect_part(callback)

@@ -17,7 +17,7 @@ from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, train
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
-from sb3_reinforce.estimation.scores import parameters_of
+from sb3_reinforce.estimation.scores import first_step, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
 
@@ -195,7 +195,7 @@ class PitfallCallback(Diagnosis):
             weights = select(training_weights(self.model), rollout.used).to(log_prob)
             gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), trainable(policy), allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
-        leave_no_graph(policy, self.obs, actions[: self.N_STEPS])
+            leave_no_graph(policy, *first_step(rollout))
 
     def _on_rollout_start(self) -> None:
         self._examine()

@@ -118,7 +118,7 @@ def compare_estimators(
             if name == LIKELIHOOD_RATIO:
                 gradients, n_steps = likelihood_ratio(model, n_episodes)
             else:
-                k = default_n_delta(n_parameters) if n_delta is None else n_delta
+                k = default_n_delta(n_parameters, name, draw) if n_delta is None else n_delta
                 deltas = (sample_deltas(draw, k, n_parameters, scale, generator) for _ in range(n_estimates))
                 gradients = th.stack([ESTIMATORS[name](utility, utility.theta, each) for each in deltas])
                 n_steps = utility.n_steps - n_steps_before

@@ -13,7 +13,6 @@ try:
     import matplotlib.pyplot as plt
     from matplotlib.axes import Axes
     from matplotlib.ticker import NullLocator
-    from scipy.stats import t as student_t
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         f"sb3_reinforce.diagnostics.plots needs {error.name}: pip install 'sb3-reinforce[plots]'"
@@ -159,8 +158,8 @@ def plot_variances(
     """
     Plot the variance of the gradient estimate against its number of episodes, for each of several baselines.
 
-    A point is the mean over repetitions, with its interval of Student's t. Points are shifted sideways, so that none is
-    hidden.
+    A point is the mean over repetitions, with the confidence interval of Student's t distribution. Points are shifted
+    sideways, so that none is hidden.
 
     :param curves: By name, variances of shape ``(n_repetitions, n_points)``
     :param n_episodes: Episodes of the points, shape ``(n_points,)``
@@ -170,6 +169,8 @@ def plot_variances(
     :raises TypeError: If ``curves`` is no dictionary
     :raises ValueError: If it is empty, there are fewer than two repetitions, or the shapes do not match
     """
+    from scipy.stats import t as student_t
+
     x = np.asarray(n_episodes, dtype=float)
     if check_number("confidence", confidence, 0, 1) == 1:
         raise ValueError("confidence must be below 1, where an interval is finite, got 1")

@@ -174,32 +174,31 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
 @th.no_grad()
 def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
     """
-    The difference between the mean of −log π over sampled actions and the entropy, in standard errors.
+    The largest difference between the mean of −log π over sampled actions and the entropy, in standard errors.
 
-    The actions are sampled at a few of the ``n_obs`` observations; the largest difference counts, or their sum. An
-    entropy without closed form is estimated from them, and then there is no difference.
+    It is measured at a few of the ``n_obs`` observations, and is the smaller one of two samples, since rare actions may
+    be missing in one. An entropy without closed form is estimated from the sample, and there is no difference.
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
-    found = []
+    errors = []
     for index in th.randperm(n_obs)[:N_ACTIONS]:
         one = take(obs, index[None])
         many = take(one, th.zeros(n_draws, dtype=th.long))
         many = without_memory(many) if isinstance(policy, RecurrentPolicy) else many
-        log_prob, entropy, _ = evaluate(policy, route_of(policy), many, draw(policy, one, n_draws), with_values=False)
-        differences = (-log_prob - entropy).double().cpu()
-        # Those of equal probabilities are rounding errors
-        if differences.std() > 1e-6:
-            found.append(differences)
-    if not found:
-        return 0.0
-    each = th.stack(found)
-    errors = standard_errors(each), standard_errors(each.sum(0))
-    return max(float(error.max()) for error in errors)
+        pair = []
+        for _ in range(2):
+            actions = draw(policy, one, n_draws)
+            log_prob, entropy, _ = evaluate(policy, route_of(policy), many, actions, with_values=False)
+            pair.append(standard_errors((-log_prob - entropy).double()))
+        errors.append(min(pair))
+    return max(errors)
 
 
-def standard_errors(samples: th.Tensor) -> th.Tensor:
-    """``|mean| / (std / √n)`` of n samples ``(..., n)``."""
-    return samples.mean(-1).abs() * math.sqrt(samples.shape[-1]) / samples.std(-1)
+def standard_errors(samples: th.Tensor) -> float:
+    """``|mean| / (std / √n)`` of n samples, ∞ where one is not finite."""
+    # Samples that are all equal differ by rounding
+    error = float(samples.mean().abs() / samples.std().clamp(min=1e-4)) * math.sqrt(len(samples))
+    return math.inf if math.isnan(error) else error
 
 
 @th.no_grad()

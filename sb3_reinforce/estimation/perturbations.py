@@ -98,13 +98,15 @@ MAX_DEFAULT_N_DELTA = 64
 MIN_DEFAULT_DELTA_STD = 0.05
 
 
-def default_n_delta(n_parameters: int) -> int:
+def default_n_delta(n_parameters: int, estimator: object, perturbation: object) -> int:
     """
-    2n perturbations, but at most 64; where these are fewer than 1.5 n, half of n, but at most 64.
+    ``min(2n, 64)`` perturbations up to n = 42 and ``min(n / 2, 64)`` beyond; differences along coordinates have n.
 
     As many random directions as parameters are nearly dependent. Noise of variance 1 in the differences gives Gaussian
     directions a ‖ĝ‖² of ``min(k, n) / (|n − k| − 1)`` on average, the mean of an inverse Wishart matrix.
     """
+    if perturbation in ("coordinate", coordinate) and estimator != "regression":
+        return min(n_parameters, MAX_DEFAULT_N_DELTA)
     k = min(2 * n_parameters, MAX_DEFAULT_N_DELTA)
     return k if k >= 1.5 * n_parameters else min(n_parameters // 2, MAX_DEFAULT_N_DELTA)
 

@@ -113,7 +113,7 @@ def minibatches(policy: ActorCriticPolicy, obs: Any, n: int, size: int) -> Itera
     if isinstance(policy, RecurrentPolicy):
         return sequence_minibatches(obs["sequence"], size)
     sizes = [min(size, n - first) for first in range(0, n, size)]
-    if sizes[-1] == 1:
+    if sizes[-1] == 1 < size:
         # BatchNorm takes no batch of one step
         sizes[-2:] = [sizes[-2] + 1]
     return th.randperm(n).to(policy.device).split(sizes)  # type: ignore[no-untyped-call, no-any-return]

@@ -140,12 +140,6 @@ def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
 
 
-@th.no_grad()
-def leave_no_graph(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> None:
-    """Evaluate a policy without a graph: it keeps its last distribution, which could not be deep-copied with one."""
-    log_prob_of(policy, obs, actions)
-
-
 def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
@@ -175,6 +169,11 @@ def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: 
     # A user's evaluate_actions may differentiate
     with th.set_grad_enabled(route.evaluate_actions and overrides(policy, "evaluate_actions")):
         return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
+
+
+def leave_no_graph(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> None:
+    """Evaluate a policy without a graph: it keeps its last distribution, which could not be deep-copied with one."""
+    acting_log_prob(policy, route_of(policy), obs, actions)
 
 
 def trainable(policy: ActorCriticPolicy) -> Parameters:

@@ -69,9 +69,9 @@ class RecurrentPolicy(ActorCriticPolicy):
         size = extractor.features_dim
         if not isinstance(size, int):
             raise ValueError(
-                f"The features_dim of {type(extractor).__name__} must be an int for a policy with a memory, got "
-                f"{size!r} of type {type(size).__name__} for {self.observation_space}: give MultiDiscrete observations "
-                "as a Box"
+                "observation_space must have features whose number is an int for a policy with a memory, got "
+                f"{self.observation_space}, for which {type(extractor).__name__} has features_dim={size!r}: give "
+                "MultiDiscrete observations as a Box"
             )
         return extractor
 

@@ -31,7 +31,7 @@ from sb3_reinforce.zoo.settings import (
 )
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-# What takes the place of a policy for other observations
+# The policies that take Dict observations in the place of others
 FOR_DICTS = dict.fromkeys(("MlpPolicy", "CnnPolicy", "LinearPolicy"), "MultiInputPolicy")
 FOR_DICTS |= dict.fromkeys(("MlpLstmPolicy", "CnnLstmPolicy"), "MultiInputLstmPolicy")
 
@@ -150,7 +150,7 @@ def fit_default(default: Settings, experiment: Experiment) -> Settings:
     if isinstance(env.action_space, spaces.Box):
         fitted.pop("temperature", None)
     if isinstance(env.observation_space, spaces.Dict):
-        fitted["policy"] = FOR_DICTS.get(default["policy"], default["policy"])
+        fitted["policy"] = FOR_DICTS.get(given["policy"], given["policy"])
     return fitted
 
 

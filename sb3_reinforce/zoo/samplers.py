@@ -11,7 +11,11 @@ from sb3_reinforce.zoo.settings import Settings
 
 
 def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
-    """Suggest a baseline, a kind of rollout, a kind of step and their settings; ``policy_kwargs`` are replaced."""
+    """
+    Suggest a baseline, a kind of rollout, a kind of step and their settings.
+
+    Configured ``policy_kwargs``, ``reward_to_go`` and ``episodes_per_start`` are replaced.
+    """
     sampled: Settings = {
         "baseline": trial.suggest_categorical("baseline", ["value", "leave_one_out", "time_mean", "optimal"]),
         "step": trial.suggest_categorical("step", ["optimizer", "natural"]),

@@ -205,6 +205,8 @@ def test_the_rule_of_thumb():
     model = make(n_delta=None)
     assert model.n_delta == 2 * model.n_parameters
     assert make(policy="MlpPolicy", n_delta=None).n_delta == 64
+    assert make(perturbation="coordinate", n_delta=None).n_delta == model.n_parameters
+    assert make(n_delta=None, n_top=50).n_delta == 50
 
 
 def test_perturbations_are_one_percent_of_theta_or_a_twentieth():

@@ -58,8 +58,14 @@ def observing(space):
             lambda env: RecurrentREINFORCE("MultiInputLstmPolicy", env),
             "policy must be MlpLstmPolicy for observations in",
         ),
-        (observing(spaces.MultiDiscrete([2, 3])), "features_dim of FlattenExtractor must be an int .* as a Box"),
-        (observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})), "features_dim of CombinedExtractor .* as a Box"),
+        (
+            observing(spaces.MultiDiscrete([2, 3])),
+            "^observation_space .* FlattenExtractor has features_dim=.* as a Box",
+        ),
+        (
+            observing(spaces.Dict({"n": spaces.MultiDiscrete([2, 3])})),
+            "^observation_space .* CombinedExtractor .* as a Box",
+        ),
         (lambda env: landscape(make_recurrent(env=env, double=False)), "must have no memory, got MlpLstmPolicy"),
         (
             lambda env: landscape(RecurrentPPO("MlpLstmPolicy", env, device="cpu")),

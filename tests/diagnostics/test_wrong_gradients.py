@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.diagnostics.policy_errors import sampling_error
 from sb3_reinforce.estimation import weights
 
 
@@ -173,10 +174,24 @@ class Warm(ActorCriticPolicy):
         return actions, values, self.evaluate_actions(obs, actions)[1]
 
 
-def test_actions_that_are_sampled_with_other_probabilities_are_seen():
-    assert failures(policy=Greedy) == ["sampling"]
-    model = REINFORCE(Warm, corridor(spaces.Box(-1, 1, (2,))), baseline="mean", device="cpu", seed=0)
-    assert "sampling" in check_gradient(model).failures
+@pytest.mark.parametrize("seed", range(3))
+def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
+    for policy, is_right in ((Greedy, False), ("MlpPolicy", True)):
+        model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=seed)
+        with th.no_grad():
+            model.policy.action_net.bias[0] = 2.0
+        assert check_gradient(model, seed=seed).failures == ([] if is_right else ["sampling"])
+    model = REINFORCE(Warm, corridor(spaces.Box(-1, 1, (2,))), baseline="mean", device="cpu", seed=seed)
+    assert "sampling" in check_gradient(model, seed=seed).failures
+
+
+def test_a_rare_action_is_no_false_alarm():
+    """Of two actions, one with a probability of 0.006, which varies by half of its frequency in a sample."""
+    model = REINFORCE("MlpPolicy", corridor(spaces.Discrete(2)), device="cpu", seed=0)
+    with th.no_grad():
+        model.policy.action_net.bias.copy_(th.tensor([5.11, 0.0]))
+    th.manual_seed(0)
+    assert max(sampling_error(model.policy, th.eye(7), 7) for _ in range(50)) < 5
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])

@@ -52,14 +52,22 @@ def test_coordinates_visit_all_parameters_with_alternating_sign():
 @pytest.mark.parametrize(("k", "n"), [(10, 5), (64, 42), (21, 43), (64, 300)])
 def test_noise_is_multiplied_by_the_mean_of_an_inverse_wishart_matrix(k, n):
     """Noise of variance 1 in the differences gives ĝ = Δ⁺ ε a mean square of ‖Δ⁺‖², which is infinite for k = n."""
-    assert default_n_delta(n) == k
+    assert default_n_delta(n, "central", "gaussian") == k
     squares = th.stack([th.linalg.pinv(gaussian(k, n, generator(seed))).square().sum() for seed in range(200)])
     expected = min(k, n) / (abs(n - k) - 1)
     assert abs(squares.mean() - expected) < 5 * squares.std() / 200**0.5
 
 
 def test_the_default_number_of_perturbations():
-    """2n up to 64; from there n/2 up to 64, unless 64 are at least 1.5 n. Noise is at most doubled."""
+    """At most twice the noise of a difference is in the estimate."""
     expected = {3: 6, 20: 40, 32: 64, 42: 64, 43: 21, 64: 32, 127: 63, 129: 64, 5000: 64}
-    assert {n: default_n_delta(n) for n in expected} == expected
+    assert {n: default_n_delta(n, "forward", gaussian) for n in expected} == expected
     assert all(min(k, n) / (abs(n - k) - 1) <= 2 for n, k in expected.items())
+
+
+@pytest.mark.parametrize("perturbation", ["coordinate", coordinate])
+def test_coordinates_do_not_depend_on_each_other(perturbation):
+    """Twice as many would make forward differences central."""
+    for estimator in ("forward", "central"):
+        assert [default_n_delta(n, estimator, perturbation) for n in (1, 20, 60, 99)] == [1, 20, 60, 64]
+    assert default_n_delta(20, "regression", perturbation) == 40

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback
 from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies.evaluation import log_prob_of, route_of, sampled_divergence, some_steps
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -81,8 +82,11 @@ class Differentiating(ActorCriticPolicy):
         return values, log_prob - 1e-3 * slope.square().sum(1), entropy
 
 
-def test_a_policy_that_differentiates_has_a_divergence_too():
-    model = REINFORCE(Differentiating, "CartPole-v1", n_steps=64, seed=0, device="cpu").learn(64)
+@pytest.mark.parametrize("rollout", [{"n_steps": 64}, {"n_episodes": 3, "baseline": "optimal"}])
+def test_a_policy_that_differentiates_has_a_divergence_too(rollout):
+    """And can be measured."""
+    model = REINFORCE(Differentiating, "CartPole-v1", seed=0, device="cpu", **rollout)
+    model.learn(1, [PitfallCallback(), GradientQualityCallback(1)])
     assert model.logger.name_to_value["train/kl"] > 0
 
 
