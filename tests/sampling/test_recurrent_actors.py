@@ -79,6 +79,10 @@ class OwnLstm(th.nn.LSTM):
     """A class of the user."""
 
 
+# For single steps and for whole sequences
+METHODS = ("get_distribution", "sequence_distribution")
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -86,9 +90,9 @@ class OwnLstm(th.nn.LSTM):
         lambda policy: policy.mlp_extractor.policy_net.register_forward_hook(lambda module, inputs, outputs: outputs),
         lambda policy: setattr(policy.lstm_actor, "forward", policy.lstm_actor.forward),
         lambda policy: setattr(policy, "lstm_actor", OwnLstm(5, 4)),
-        lambda policy: setattr(policy, "get_distribution", policy.get_distribution),
+        lambda policy: vars(policy).update({name: getattr(policy, name) for name in METHODS}),
     ],
-    ids=["hook of the LSTM", "hook of the MLP", "method of the LSTM", "another LSTM", "method of the policy"],
+    ids=["hook of the LSTM", "hook of the MLP", "method of the LSTM", "another LSTM", "methods of the policy"],
 )
 def test_a_change_during_a_rollout_counts_at_once(change):
     model = make_recurrent(env=corridor(ACTIONS[0]), double=False, n_steps=20)
