@@ -58,12 +58,12 @@ def natural() -> str:
 
 def seconds() -> str:
     """The CPU seconds that the runs took, on the seeds that all have."""
-    rows = final("comparison").query("seed < 5")
     lines = []
-    for task, runs in rows[rows["algorithm"].isin(["reinforce", "a2c", "ppo"])].groupby("task", sort=False):
+    for task, runs in final("comparison").query("seed < 5").groupby("task", sort=False):
         medians = runs.groupby("algorithm")["cpu_seconds"].median()
-        lines.append([task, *(number(medians[name], 0) for name in ("reinforce", "a2c", "ppo"))])
-    return markdown(["task", "REINFORCE", "A2C", "PPO"], lines)
+        names = ("reinforce", *PEERS)
+        lines.append([task, *(number(medians[name], 0) if name in medians else NONE for name in names)])
+    return markdown(["task", "REINFORCE", "A2C", "PPO", "TRPO"], lines)
 
 
 def readme() -> str:
