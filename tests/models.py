@@ -100,6 +100,18 @@ class Experts(FlattenExtractor):
         return outputs
 
 
+class Normalized(FlattenExtractor):
+    """Features that are normalized by their batch in training mode."""
+
+    def __init__(self, space: spaces.Space[Any]):
+        super().__init__(space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        normalized: th.Tensor = self.norm(super().forward(observations))
+        return normalized
+
+
 class Scaled(FlattenExtractor):
     """A user's features extractor with a parameter, which a policy that shares it knows by three names."""
 

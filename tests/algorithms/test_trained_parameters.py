@@ -5,10 +5,9 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
-from models import Experts, all_kinds, make, moved_by_learning, plain
+from models import Experts, Normalized, all_kinds, make, moved_by_learning, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 
@@ -155,20 +154,13 @@ def test_a_callback_finds_the_gradients_of_the_last_update():
     assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-5)
 
 
-class Normalized(FlattenExtractor):
-    """Features that are normalized by their batch."""
-
-    def __init__(self, space):
-        super().__init__(space)
-        self.norm = th.nn.BatchNorm1d(self.features_dim)
-
-    def forward(self, observations):
-        return self.norm(super().forward(observations))
-
-
 def test_no_minibatch_of_the_critic_has_one_step():
     kwargs = {"features_extractor_class": Normalized, "share_features_extractor": False, "net_arch": [4]}
-    make("steps", n_steps=9, batch_size=4, policy_kwargs=kwargs).learn(9)
+    model = make("steps", n_steps=9, batch_size=4, policy_kwargs=kwargs)
+    sizes = []
+    model.policy.value_net.register_forward_hook(lambda module, inputs, output: sizes.append(len(output)))
+    model.learn(9)
+    assert sizes[-2:] == [4, 5]
 
 
 class MeanEntropy(ActorCriticPolicy):

@@ -10,6 +10,7 @@ import torch as th
 from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
+from models import Normalized
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -276,17 +277,6 @@ class Dropping(FlattenExtractor):
 
     def forward(self, observations):
         return th.nn.functional.dropout(super().forward(observations), training=self.training)
-
-
-class Normalized(FlattenExtractor):
-    """Features that are normalized by their batch in training mode."""
-
-    def __init__(self, space):
-        super().__init__(space)
-        self.norm = th.nn.BatchNorm1d(self.features_dim)
-
-    def forward(self, observations):
-        return self.norm(super().forward(observations))
 
 
 @pytest.mark.parametrize(
