@@ -1,5 +1,8 @@
 """On a GPU a model learns as on the CPU, and can be saved there and loaded here. Skipped where there is no GPU."""
 
+import os
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -137,3 +140,30 @@ def test_the_laboratory_measures_on_a_gpu(kind):
     if isinstance(model, REINFORCE):
         assert check_gradient(model).passed
         assert np.isfinite([row.variance.value for row in compare_baselines(model, 8, n_resamples=2)]).all()
+
+
+TRAIN = """
+import os, sys
+import torch as th
+from test_gpu import KINDS, make
+
+rank = int(os.environ["RANK"])
+for kind in KINDS:
+    model = make(kind, sys.argv[1 + rank]).learn(300)
+    state = {name: values.cpu() for name, values in model.policy.state_dict().items()}
+    th.save((state, model.num_timesteps), f"{sys.argv[3]}/{kind} {rank}")
+"""
+
+
+@pytest.mark.parametrize("devices", [("cuda", "cuda"), ("cuda", "cpu"), ("cpu", "cuda")])
+def test_two_processes_learn_on_any_devices(devices, tmp_path):
+    (tmp_path / "train.py").write_text(TRAIN)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([*command, tmp_path / "train.py", *devices, tmp_path], env=environment, timeout=300, check=True)
+    for kind in KINDS:
+        (first, steps), (second, _) = [th.load(tmp_path / f"{kind} {rank}") for rank in range(2)]
+        assert steps >= 300
+        before = make(kind, "cpu").policy.state_dict()
+        assert any(not th.equal(first[name], before[name]) for name in first)
+        assert all(th.equal(first[name], second[name]) for name in first)
