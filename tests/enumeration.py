@@ -5,6 +5,7 @@ The policy is a softmax over a table, in float64; weights and denominators are t
 autograd through the probabilities of the trajectories.
 """
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -37,22 +38,19 @@ def make_model(ragged=False, **kwargs):
     return model
 
 
-def log_pi(logits, node, action):
-    return logits[node].log_softmax(0)[action]
+def log_prob_of(trajectory, logits=LOGITS):
+    return th.stack([logits[node].log_softmax(0)[action] for node, action, _ in trajectory]).sum()
 
 
-def score(node, action):
+def score(*step):
     logits = LOGITS.clone().requires_grad_()
-    return th.autograd.grad(log_pi(logits, node, action), logits)[0]
+    return th.autograd.grad(log_prob_of([step], logits), logits)[0]
 
 
 def true_gradient(trajectories, utility):
     """∇ Σ p(τ) utility(τ)."""
     logits = LOGITS.clone().requires_grad_()
-    expected = sum(
-        th.stack([log_pi(logits, node, action) for node, action, _ in trajectory]).sum().exp() * utility(trajectory)
-        for trajectory in trajectories
-    )
+    expected = sum(log_prob_of(trajectory, logits).exp() * utility(trajectory) for trajectory in trajectories)
     return th.autograd.grad(expected, logits)[0]
 
 
@@ -99,25 +97,31 @@ def estimate(model, batch):
     """ĝ of a batch of episodes: the package's weights and denominator, the scores of the table."""
     rollout, baseline = rollout_of(model, batch)
     weights = rollout.discounts * (rollout.returns - baseline) * rollout.used
-    terms = [weights[t, i] * score(*step[:2]) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
-    return sum(terms) / rollout.denominator, int(rollout.used.sum())
+    terms = [weights[t, i] * score(*step) for i, episode in enumerate(batch) for t, step in enumerate(episode)]
+    return sum(terms) / rollout.denominator
 
 
-def expectation(model, trajectories, n_episodes, statistic):
-    """Σ over all batches of p(batch) · statistic(ĝ, number of steps)."""
+def expectation(statistic, episodes, log_probs, n_episodes):
+    """Σ over all batches of N episodes of p(batch) · statistic(batch)."""
     total = 0.0
-    for batch in product(trajectories, repeat=n_episodes):
-        log_p = th.stack([log_pi(LOGITS, node, action) for episode in batch for node, action, _ in episode]).sum()
-        total = total + log_p.exp() * statistic(*estimate(model, batch))
+    for batch in product(range(len(episodes)), repeat=n_episodes):
+        p = th.stack([log_probs[i] for i in batch]).sum().exp().detach()
+        total = total + p * statistic([episodes[i] for i in batch])
     return total
 
 
-def expected_gradient(model, n_episodes=2):
-    return expectation(model, model.env.envs[0].unwrapped.trajectories(), n_episodes, lambda gradient, steps: gradient)
+def trajectories_of(model):
+    return model.env.envs[0].unwrapped.trajectories()
+
+
+def expected_gradient(model, n_episodes=2, statistic=estimate):
+    trajectories = trajectories_of(model)
+    log_probs = [log_prob_of(trajectory) for trajectory in trajectories]
+    return expectation(partial(statistic, model), trajectories, log_probs, n_episodes)
 
 
 def gradient_of_return(model):
-    return true_gradient(model.env.envs[0].unwrapped.trajectories(), discounted_return)
+    return true_gradient(trajectories_of(model), discounted_return)
 
 
 def assert_equal(gradient, expected):
@@ -128,6 +132,6 @@ def episode_terms(trajectory, reward_to_go):
     """A and S of an episode: Σ_t γ^t score_t G_t and Σ_t γ^t score_t, or Σ_t score_t G_0 and Σ_t score_t."""
     discounts = [GAMMA ** (t * reward_to_go) for t in range(len(trajectory))]
     returns = [discounted_return(trajectory, t * reward_to_go) for t in range(len(trajectory))]
-    scores = [score(node, action).flatten() for node, action, _ in trajectory]
+    scores = [score(*step).flatten() for step in trajectory]
     weighted = [d * g * s for d, g, s in zip(discounts, returns, scores, strict=True)]
     return sum(weighted), sum(d * s for d, s in zip(discounts, scores, strict=True))

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch as th
-from enumeration import LOGITS, episode_terms, log_pi
+from enumeration import assert_equal, episode_terms, expectation, log_prob_of
 from environments import Tree
 
 from sb3_reinforce.diagnostics.estimator_comparison import compare_to_reference
@@ -44,15 +44,17 @@ def test_variance_and_signal_are_unbiased_on_the_tree():
     """Σ over all samples of 3 episodes of p(sample) · statistic is the statistic of the distribution."""
     trajectories = Tree().trajectories()
     gradients = th.stack([episode_terms(trajectory, True)[0] for trajectory in trajectories])
-    p = th.stack([th.stack([log_pi(LOGITS, n, a) for n, a, _ in t]).sum().exp() for t in trajectories])
+    log_probs = th.stack([log_prob_of(trajectory) for trajectory in trajectories])
+    p = log_probs.exp()
     signal = (p @ gradients).square().sum()
     trace = p @ gradients.square().sum(1) - signal
-    expected = th.zeros(2, dtype=th.float64)
-    for sample in product(range(len(trajectories)), repeat=3):
-        chosen = gradients[list(sample)]
+
+    def estimates(sample):
+        chosen = th.stack(sample)
         found = compute_moments(chosen @ chosen.T, th.ones(1, 3, dtype=th.float64))
-        expected += p[list(sample)].prod() * th.stack([variance(found)[0], found.signal[0]])
-    th.testing.assert_close(expected, th.stack([trace, signal]), rtol=0, atol=1e-10)
+        return th.stack([variance(found)[0], found.signal[0]])
+
+    assert_equal(expectation(estimates, gradients, log_probs, 3), th.stack([trace, signal]))
 
 
 def test_ratios_are_each_others_inverse_and_no_signal_is_an_infinite_noise_scale():

@@ -1,22 +1,20 @@
 """The expected gradient by exact enumeration against ∇E[G_0], for each baseline and each option."""
 
-from functools import partial
 from itertools import product
 
 import pytest
 import torch as th
 from enumeration import (
-    LOGITS,
     assert_equal,
     discounted_return,
     episode_terms,
     estimate,
-    expectation,
     expected_gradient,
     gradient_of_return,
-    log_pi,
+    log_prob_of,
     make_model,
     rollout_of,
+    trajectories_of,
     true_gradient,
 )
 from environments import Tree
@@ -82,27 +80,26 @@ def test_groups_that_share_their_start(baseline, m, ragged, factor):
     model = make_model(ragged, baseline=baseline, n_episodes=2 * m)
     model.episodes_per_start = m
     scales = (1.0,) * m + (10.0,) * m
-    total = 0.0
-    for batch in product(model.env.envs[0].unwrapped.trajectories(), repeat=2 * m):
-        log_p = th.stack([log_pi(LOGITS, node, action) for episode in batch for node, action, _ in episode]).sum()
+
+    def estimate_scaled(model, batch):
         scaled = [
             [(node, action, scale * reward) for node, action, reward in episode]
             for scale, episode in zip(scales, batch, strict=True)
         ]
-        total = total + log_p.exp() * estimate(model, scaled)[0]
-    assert_equal(total, factor * 5.5 * gradient_of_return(model))
+        return estimate(model, scaled)
+
+    assert_equal(expected_gradient(model, 2 * m, estimate_scaled), factor * 5.5 * gradient_of_return(model))
 
 
 def test_mean_is_biased_as_documented():
     """E[ĝ] = ∇E[Σ_t γ^t r_t] − ∇E[mean of the episode's returns] / N, for episodes of one length and no γ^t."""
     model = make_model(baseline="mean", discount_scores=False)
     without = expected_gradient(make_model(baseline="none", discount_scores=False))
-    trajectories = model.env.envs[0].unwrapped.trajectories()
 
     def mean_return(trajectory):
         return sum(discounted_return(trajectory, t) for t in range(2)) / 2
 
-    assert_equal(expected_gradient(model), without - true_gradient(trajectories, mean_return) / 2)
+    assert_equal(expected_gradient(model), without - true_gradient(trajectories_of(model), mean_return) / 2)
 
 
 def test_without_discounted_scores_the_gradient_is_another():
@@ -113,9 +110,12 @@ def test_without_discounted_scores_the_gradient_is_another():
 def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
     """The sum before the division is not; the ratio is not even parallel to ∇E[G_0]."""
     model = make_model(ragged=True, baseline="none", normalize_by="steps")
-    expect = partial(expectation, model, model.env.envs[0].unwrapped.trajectories(), 2)
-    gradient, sums = expect(lambda g, n: g), expect(lambda g, n: g * n)
-    assert_equal(sums, 2 * gradient_of_return(model))
+
+    def sum_of(model, batch):
+        return estimate(model, batch) * sum(map(len, batch))
+
+    gradient = expected_gradient(model)
+    assert_equal(expected_gradient(model, statistic=sum_of), 2 * gradient_of_return(model))
     assert th.cosine_similarity(gradient.flatten(), gradient_of_return(model).flatten(), dim=0) < 1 - 1e-4
 
 
@@ -142,9 +142,7 @@ def test_optimal_is_its_formula_on_the_other_episodes(reward_to_go, numbers_at_o
 @pytest.mark.parametrize("reward_to_go", [False, True])
 def test_that_formula_minimizes_the_trace_of_the_covariance(reward_to_go):
     trajectories = Tree().trajectories()
-    probabilities = th.stack(
-        [th.stack([log_pi(LOGITS, node, action) for node, action, _ in t]).sum().exp() for t in trajectories]
-    )
+    probabilities = th.stack([log_prob_of(trajectory) for trajectory in trajectories]).exp()
     a, s = (th.stack(part) for part in zip(*(episode_terms(t, reward_to_go) for t in trajectories), strict=True))
 
     def trace(constant):

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch as th
-from enumeration import GAMMA, assert_equal, discounted_return, rollout_of
+from enumeration import GAMMA, assert_equal, discounted_return, expectation, rollout_of
 from enumeration import make_model as make_unmasked
 from environments import Tree
 from gymnasium import spaces
@@ -145,19 +145,20 @@ def test_the_expected_gradient_is_that_of_the_expected_return(baseline, ragged):
         logits = [(weight[:, node] + bias, action, th.tensor(tree.masks[node])) for node, action, _ in episode]
         return sum(z[action] - z[allowed].logsumexp(0) for z, action, allowed in logits)
 
-    expected = 0.0
-    for batch in product(tree.trajectories(), repeat=n_episodes):
+    def estimate(batch):
         rollout, _ = rollout_of(unmasked, batch)
         masks = th.tensor(tree.masks)[rollout.observations.argmax(-1)]
         observations = {"observation": rollout.observations, "action_mask": masks}
         rollout = replace(rollout, observations=observations, policy=policy)
         weights = rollout.discounts * (rollout.returns - BASELINES[baseline](rollout))
-        gradient = gradients_by_episode(rollout, weights).sum((0, 1)) / rollout.denominator
-        expected = expected + th.stack([log_prob(episode) for episode in batch]).sum().exp().detach() * gradient
-    utility = sum(log_prob(episode).exp() * discounted_return(episode) for episode in tree.trajectories())
-    true = th.autograd.grad(utility, parameters)
-    assert GAMMA < 1 and float(th.cat([part.flatten() for part in true]).norm()) > 0.1
-    assert_equal(expected, th.cat([part.flatten() for part in true]))
+        return gradients_by_episode(rollout, weights).sum((0, 1)) / rollout.denominator
+
+    trajectories = tree.trajectories()
+    log_probs = th.stack([log_prob(trajectory) for trajectory in trajectories])
+    utilities = th.tensor([discounted_return(trajectory) for trajectory in trajectories])
+    true = th.nn.utils.parameters_to_vector(th.autograd.grad(log_probs.exp() @ utilities.double(), parameters))
+    assert GAMMA < 1 and float(true.norm()) > 0.1
+    assert_equal(expectation(estimate, trajectories, log_probs.detach(), n_episodes), true)
 
 
 class Norm(BaseFeaturesExtractor):
