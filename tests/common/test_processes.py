@@ -197,6 +197,14 @@ def test_processes_with_other_arguments_are_refused(name, tmp_path):
     assert str(first) == str(second) and DIFFERENT[name] in str(second) and "process 1 has" in str(second)
 
 
+def test_verbose_and_tensorboard_log_may_differ(tmp_path):
+    def learn(rank):
+        folder = str(tmp_path) if rank == 0 else None
+        return make("steps", corridors(1), verbose=1 - rank, tensorboard_log=folder).learn(32).num_timesteps
+
+    assert in_processes(2, learn, tmp_path) == [32, 32]
+
+
 def actions_of_all(rank, path):
     """With restored generators, with the same seed in all, and after a callback has changed policy or temperature."""
     restored = KINDS["steps"][0].load(path, corridors(1), restore_random_state=True)
