@@ -156,17 +156,13 @@ class RecurrentREINFORCE(REINFORCE):
             # A callback has changed the policy during the rollout
             state = self._actor.state()
         else:
-            starts = th.as_tensor(self._episode_starts(), device=self.device)
+            starts = th.as_tensor(self._last_episode_starts, device=self.device)
             self._state = None
             if self._next_state is not None and not starts.all():
                 self._state = self._next_state[: self.n_envs].to(self.device) * ~starts[..., None, None, None, None]
             state = (policy.zero_state(self.n_envs) if self._state is None else self._state)[:, 0]
-        self._actor = make_recurrent_actor(policy, state, self._episode_starts, with_log_prob)
+        self._actor = make_recurrent_actor(policy, state, lambda: cast(Bools, self._last_episode_starts), with_log_prob)
         return self._actor
-
-    def _episode_starts(self) -> Bools:
-        """Where episodes start with the observation at hand; some VecEnvs give numbers."""
-        return np.asarray(self._last_episode_starts, dtype=bool)
 
     def _state_after_rollout(self) -> th.Tensor:
         """The states at the cut; the critic's are computed from the rollout, in process 0 for the columns of all."""
@@ -197,8 +193,7 @@ class RecurrentREINFORCE(REINFORCE):
         values = policy.sequence_values(concatenate(flatten(rows), following)).flatten().cpu().numpy()
         values, last_values, terminal_values = np.split(values, [n_steps * n_envs, (n_steps + 1) * n_envs])
         values = values.reshape(dones.shape)
-        at_limits = dict(zip(terminal_obs, terminal_values, strict=True))
-        return values, next_values_of(values, dones, last_values, at_limits)
+        return values, next_values_of(values, dones, last_values, terminal_obs, terminal_values)
 
 
 def check_sequence_methods(policy: type, own: Collection[str]) -> None:

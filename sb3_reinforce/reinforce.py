@@ -309,9 +309,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         n_steps = self.n_steps
-        before = self.env
+        env_before = self.env
         callback.on_rollout_start()
-        if self.env is not before:
+        if self.env is not env_before:
             env = cast(VecEnv, self.env)
         # The user or a callback may have changed arguments
         check_reinforce(self, BASELINES)
@@ -332,7 +332,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         baseline = self._function("baseline", BASELINES)
         route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
-        is_collected = False
+        is_whole = False
         self.is_collecting = True
         try:
             collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
@@ -345,14 +345,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
                 self.rollout = self._complete(rollout_buffer, columns, route, baseline, n_rollout_steps is not None)
-            is_collected = True
+            is_whole = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
             check_rollout_data(rollout_buffer, self._last_obs, {})
             raise
         finally:
             self.is_collecting = False
-            if not is_collected or has_given_seeds(env):
+            if not is_whole or has_given_seeds(env):
                 # The environments stopped in the middle of episodes, or may draw the same random numbers: they are
                 # reset before they are used again
                 self._last_obs = None
@@ -475,20 +475,18 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self, route: Route, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor
     ) -> tuple[float, float]:
         """Step against the gradients; return their norm and the divergence. ``log_prob`` is log π before the step."""
+        obs, actions = batch.observations, batch.actions
         if self.step == "natural":
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
-            check_distribution(self.policy, batch.observations, batch.actions, log_prob)
-            grad_norm, kl = natural_step(self.policy, batch.observations, actor, gradients, target_kl)
-        else:
-            obs, actions = batch.observations, batch.actions
-            if route.actor is None:
-                # Passes over images or sequences take long, and those in training mode cannot be repeated
-                obs, actions = some_steps(self.policy, obs, actions)
-                log_prob = acting_log_prob(self.policy, route, obs, actions)
-            with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
-                grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
-            kl = sampled_divergence(self.policy, route, obs, actions, log_prob)
-        return grad_norm, kl
+            check_distribution(self.policy, obs, actions, log_prob)
+            return natural_step(self.policy, obs, actor, gradients, target_kl)
+        if route.actor is None:
+            # Passes over images or sequences take long, and those in training mode cannot be repeated
+            obs, actions = some_steps(self.policy, obs, actions)
+            log_prob = acting_log_prob(self.policy, route, obs, actions)
+        with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
+            grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
+        return grad_norm, sampled_divergence(self.policy, route, obs, actions, log_prob)
 
     def _train_critic(
         self, route: Route, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float

@@ -114,8 +114,8 @@ class Distributed(BaseAlgorithm):
         processes = self._processes
         if processes is None:
             return n_episodes
-        each, more = divmod(n_episodes, processes.size * self.n_envs)
-        return each * self.n_envs + min(max(more - processes.rank * self.n_envs, 0), self.n_envs)
+        # Episode e is of environment e modulo W·n
+        return sum(e // self.n_envs % processes.size == processes.rank for e in range(n_episodes))
 
     def start_round(self) -> None:
         """Process 0 lets the others collect too."""

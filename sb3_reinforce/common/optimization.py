@@ -50,7 +50,7 @@ def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parame
     try:
         yield
     finally:
-        if not math.isfinite(th.linalg.vector_norm(to_vector(parameters), ord=math.inf)):
+        if not to_vector(parameters).isfinite().all():
             with th.no_grad():
                 for parameter, old in zip(parameters, before, strict=True):
                     parameter.copy_(old)

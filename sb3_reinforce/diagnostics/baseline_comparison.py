@@ -10,7 +10,7 @@ import torch as th
 from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number
 from sb3_reinforce.diagnostics.sampling import check_model, sample, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise, variance
-from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resamples
+from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resample_counts
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, parameters_of
@@ -79,7 +79,7 @@ def compare_baselines(
     check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
     check_number("confidence", confidence, 0, 1)
-    counts = resamples(n_episodes, n_resamples, seed)
+    counts = resample_counts(n_episodes, n_resamples, seed)
     with seeded(model.policy, seed):
         rollout = sample(model, n_episodes, progress_bar=progress_bar)
         rows = baseline_rows(rollout, functions, reference, counts, confidence)

@@ -12,7 +12,7 @@ from sb3_reinforce.common.arguments import check_choice, check_function, check_i
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
-from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resamples
+from sb3_reinforce.diagnostics.tables import Estimate, Table, interval, resample_counts
 from sb3_reinforce.envs.starts import reseed
 from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.estimators import ESTIMATORS
@@ -141,8 +141,8 @@ def compare_to_reference(
     gradients: th.Tensor, reference: th.Tensor, n_resamples: int, confidence: float, seed: int
 ) -> tuple[Estimate, Estimate]:
     """Cosine of estimates ``(m, n)`` to other gradients ``(m', n)``, and the signal-to-noise ratio of one estimate."""
-    counts = resamples(len(gradients), n_resamples, seed)
-    others = resamples(len(reference), n_resamples, seed + 1)
+    counts = resample_counts(len(gradients), n_resamples, seed)
+    others = resample_counts(len(reference), n_resamples, seed + 1)
     moments = compute_moments(gram(gradients), counts)
     # ⟨E g, E r⟩ of each pair of resamples
     products = (counts @ gram(gradients, reference) * others).sum(1) / (counts.sum(1) * others.sum(1))

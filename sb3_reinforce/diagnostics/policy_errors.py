@@ -164,10 +164,9 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
         # The effect of a step is clearest for the action that is farthest from the rest
         action = draws[int(th.stack([closeness(policy, draws, draws[i]) for i in range(8)]).argmin())]
         before, after = closeness_after_step(policy, one, action, n_draws)
-        if before < closeness(policy, action[None].expand_as(draws), action):
-            # The count of a rare action may happen to stay the same
-            if after != before:
-                wrong.append(bool(after < before))
+        # The count of a rare action may happen to stay the same
+        if after != before and before < closeness(policy, action[None].expand_as(draws), action):
+            wrong.append(bool(after < before))
     return sum(wrong) / len(wrong) if wrong else float("nan")
 
 

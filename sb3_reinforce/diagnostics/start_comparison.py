@@ -12,7 +12,7 @@ from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
-from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resamples
+from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resample_counts
 from sb3_reinforce.envs.starts import check_groups
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import CHUNK
@@ -75,7 +75,7 @@ def compare_starts(
     step = env.num_envs // math.gcd(env.num_envs, N_PER_START)
     n_starts = math.ceil(check_integer("n_starts", n_starts, 4) / step) * step
     check_number("confidence", confidence, 0, 1)
-    counts = resamples(n_starts, n_resamples, seed)
+    counts = resample_counts(n_starts, n_resamples, seed)
     with seeded(model.policy, seed):
         rollouts = sample_starts(model, n_starts, progress_bar)
         # G_t and m_t, (n_steps, n_starts, N_PER_START)

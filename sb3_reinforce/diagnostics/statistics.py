@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch as th
 
 from sb3_reinforce.common.arguments import check_kind, check_number
-from sb3_reinforce.diagnostics.tables import Estimate, interval, resamples
+from sb3_reinforce.diagnostics.tables import Estimate, interval, resample_counts
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def gradient_statistics(
     """
     gradients = check_samples(gradients)
     check_number("confidence", confidence, 0, 1)
-    counts = resamples(len(gradients), n_resamples, seed)
+    counts = resample_counts(len(gradients), n_resamples, seed)
     moments = compute_moments(gram(gradients), counts)
     to_reference = None
     if reference is not None:

@@ -32,7 +32,7 @@ class Estimate:
 UNKNOWN = Estimate(float("nan"), float("nan"), float("nan"))
 
 
-def resamples(m: int, n_resamples: int, seed: int) -> th.Tensor:
+def resample_counts(m: int, n_resamples: int, seed: int) -> th.Tensor:
     """How often each of m samples occurs in the sample itself (row 0) and in resamples, ``(1 + n_resamples, m)``."""
     size = (check_integer("n_resamples", n_resamples, 1), m)
     drawn = th.randint(m, size, generator=th.Generator().manual_seed(check_integer("seed", seed, 0)))

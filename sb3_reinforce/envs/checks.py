@@ -12,7 +12,11 @@ class BadData(ValueError):
 
 
 def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
-    """Check numbers (n_steps, n_envs, ...) less the leading indices in ``where``; the step None is the present one."""
+    """
+    Check that numbers are finite. Their indices, after those in ``where``, begin with step and environment.
+
+    The step None is the present one.
+    """
     if isinstance(values, dict):
         for key, part in values.items():
             check_finite(f"{name} {key!r}", part, where)

@@ -11,13 +11,14 @@ from functools import partial, wraps
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_reinforce.common.interruptions import interruptible
+from sb3_reinforce.common.moments import normalizers
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
-from sb3_reinforce.envs.starts import has_given_seeds, separate
+from sb3_reinforce.envs.starts import give_new_seeds, has_given_seeds
 from sb3_reinforce.envs.workers import watch
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
@@ -45,7 +46,7 @@ def guarded(learn: Learn) -> Learn:
 def forget_seeds(model: Any) -> None:
     """Let a model whose environments have given seeds start new episodes, with different random numbers."""
     if model.env is not None and has_given_seeds(model.env):
-        separate(model.env)
+        give_new_seeds(model.env)
         model._last_obs = None
 
 
@@ -61,12 +62,10 @@ def guard(env: VecEnv | None) -> Iterator[None]:
         if type(base) is DummyVecEnv and {"step", "step_async", "step_wait", "reset"}.isdisjoint(vars(base)):
             replace(stack, base, "step_wait", partial(stepping.step_wait, base))
             replace(stack, base, "reset", partial(stepping.reset, base))
-        while isinstance(env, VecEnvWrapper):
-            below = env.venv
-            if isinstance(env, VecNormalize):
-                replace(stack, below, "step_wait", partial(finite_step, below.step_wait))
-                replace(stack, below, "reset", partial(finite_reset, below.reset))
-            env = below
+        for each in normalizers(env):
+            below = each.venv
+            replace(stack, below, "step_wait", partial(finite_step, below.step_wait))
+            replace(stack, below, "reset", partial(finite_reset, below.reset))
         yield
 
 
@@ -91,9 +90,8 @@ def finite_step(step: Callable[[], VecEnvStepReturn]) -> VecEnvStepReturn:
     obs, rewards, dones, infos = step()
     check_finite("The reward", rewards, (None,))
     check_finite("The observation", obs, (None,))
-    if dones.any():
-        for i in np.flatnonzero(dones).tolist():
-            check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
+    for i in np.flatnonzero(dones).tolist():
+        check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
     return obs, rewards, dones, infos
 
 

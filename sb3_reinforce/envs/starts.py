@@ -17,7 +17,7 @@ MARK = "has_given_seeds"
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     """The first observations of episodes, environment i with the seed ``seeds[i]``; None leaves the seeds open."""
     if seeds is None:
-        separate(env)
+        give_new_seeds(env)
         return env.reset()
     setattr(env.unwrapped, MARK, True)
     # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
@@ -50,7 +50,7 @@ def has_given_seeds(env: VecEnv) -> bool:
     return getattr(env.unwrapped, MARK, False)
 
 
-def separate(env: VecEnv) -> None:
+def give_new_seeds(env: VecEnv) -> None:
     """Give environments with given seeds new and different ones, from their next reset on."""
     if has_given_seeds(env):
         # By NumPy's generator: measurements seed PyTorch's, and training would repeat its starts after each of them

@@ -103,21 +103,18 @@ def optimal(rollout: Rollout) -> th.Tensor:
     b = th.zeros_like(products)
     for group in th.unique(rollout.groups):
         members = th.unique(rollout.episodes[rollout.groups == group])
-        b[members] = ratio_of_others(products[members], squares[members])
+        above = sum_of_others(products[members])
+        below = sum_of_others(squares[members])
+        b[members] = th.where(below > 0, above / below, 0.0)
     return b[rollout.episodes]
-
-
-def ratio_of_others(products: th.Tensor, squares: th.Tensor) -> th.Tensor:
-    """``b_i = Σ_{j≠i} products_j / Σ_{j≠i} squares_j``, and 0 where the latter is 0; all of shape ``(n_episodes,)``."""
-    above = sum_of_others(products)
-    below = sum_of_others(squares)
-    return th.where(below > 0, above / below.clamp(min=th.finfo(below.dtype).tiny), 0.0)
 
 
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
-    # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖²: in float32 equal returns c would have a baseline that differs from c
-    level = group_means(rollout)
+    # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖², with the mean c of G in the group: in float32 equal returns c would have a
+    # baseline that differs from c
+    totals, counts = _sums_at(rollout.groups, rollout)
+    level = totals / counts.clamp(min=1)
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
     for group in th.split(rollout.used_episodes, max(1, CHUNK // (2 * n_parameters))):
@@ -129,12 +126,6 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     levels = th.zeros_like(squares)
     levels[rollout.episodes] = level
     return centred + levels * squares, squares
-
-
-def group_means(rollout: Rollout) -> th.Tensor:
-    """The mean of G over the used steps of its group, at each step."""
-    totals, counts = _sums_at(rollout.groups, rollout)
-    return totals / counts.clamp(min=1)
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:

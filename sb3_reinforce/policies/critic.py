@@ -47,15 +47,19 @@ def values_after(
 
     last_values = predict(last_obs)
     terminal_values = predict(stack(list(terminal_obs.values()))) if terminal_obs else ()
-    return next_values_of(values, dones, last_values, dict(zip(terminal_obs, terminal_values, strict=True)))
+    return next_values_of(values, dones, last_values, terminal_obs, terminal_values)
 
 
 def next_values_of(
-    values: np.ndarray, dones: NDArray[np.bool_], last_values: np.ndarray, terminal_values: dict[tuple[int, int], float]
+    values: np.ndarray,
+    dones: NDArray[np.bool_],
+    last_values: np.ndarray,
+    limits: Iterable[tuple[int, int]],
+    terminal_values: Iterable[float],
 ) -> np.ndarray:
-    """V(s_{t+1}) from V(s_t), V after the last step ``(n_envs,)`` and V by (step, environment) at time limits."""
+    """V(s_{t+1}) from V(s_t), V after the last step ``(n_envs,)`` and V at time limits, each at (step, environment)."""
     next_values = np.where(dones, 0.0, np.vstack([values[1:], last_values]))
-    for where, value in terminal_values.items():
+    for where, value in zip(limits, terminal_values, strict=True):
         next_values[where] = value
     return next_values
 
@@ -112,11 +116,10 @@ def minibatches(policy: ActorCriticPolicy, obs: Any, n: int, size: int) -> Itera
         return [slice(None)]
     if isinstance(policy, RecurrentPolicy):
         return sequence_minibatches(obs["sequence"], size)
-    sizes = [min(size, n - first) for first in range(0, n, size)]
-    if sizes[-1] == 1 < size:
-        # BatchNorm takes no batch of one step
-        sizes[-2:] = [sizes[-2] + 1]
-    return th.randperm(n).to(policy.device).split(sizes)  # type: ignore[no-untyped-call, no-any-return]
+    batches = th.randperm(n).to(policy.device).split(size)  # type: ignore[no-untyped-call]
+    # BatchNorm takes no batch of one step
+    is_single = len(batches[-1]) == 1 < size
+    return [*batches[:-2], th.cat(batches[-2:])] if is_single else batches
 
 
 def value_of_batch(

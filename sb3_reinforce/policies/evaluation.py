@@ -66,12 +66,12 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
         return Route(with_critic, actor, critic)
     own_parts = overrides(policy, "predict_values", "get_distribution")
     shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
-    together = with_critic and shares and not own_parts
+    at_once = with_critic and shares and not own_parts
     return Route(
         with_critic,
         critic=critic,
-        forward=together or must_call(policy, "forward"),
-        evaluate_actions=together or must_call(policy, "evaluate_actions"),
+        forward=at_once or must_call(policy, "forward"),
+        evaluate_actions=at_once or must_call(policy, "evaluate_actions"),
     )
 
 

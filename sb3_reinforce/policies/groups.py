@@ -16,7 +16,7 @@ class ParameterGroups:
     """
 
     def __init__(self) -> None:
-        self.present: tuple[tuple[int, bool], ...] = ()
+        self.sorted_for: tuple[tuple[int, bool], ...] = ()
         self.of_actor: set[th.nn.Parameter] = set()
         self.of_critic: set[th.nn.Parameter] = set()
 
@@ -26,8 +26,8 @@ class ParameterGroups:
         """The trainable parameters of the three groups, in the policy's order."""
         parameters = trainable(policy)
         present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
-        if self.present != present:
-            self.present, self.of_actor, self.of_critic = present, set(), set()
+        if self.sorted_for != present:
+            self.sorted_for, self.of_actor, self.of_critic = present, set(), set()
         if not self.of_actor | self.of_critic >= set(parameters):
             policy.set_training_mode(False)
             self.of_actor.update(actor_parameters(policy, obs, actions))

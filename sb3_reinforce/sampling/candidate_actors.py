@@ -47,8 +47,8 @@ class LoopActor:
     def act(self, obs: Any) -> np.ndarray:
         """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
         centre = to_vector(self.searched)
-        kind = vars(self.policy.action_dist)
-        noise: dict[str, Any] = {name: kind[name] for name in MATRICES if name in kind}
+        attributes = vars(self.policy.action_dist)
+        noise: dict[str, Any] = {name: attributes[name] for name in MATRICES if name in attributes}
         actions = []
         try:
             for i, theta in enumerate(self.thetas):
@@ -60,7 +60,7 @@ class LoopActor:
                 actions.append(action)
         finally:
             parameters.write(self.searched, centre)
-            kind.update(noise)
+            attributes.update(noise)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 
 

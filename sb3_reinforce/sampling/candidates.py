@@ -35,7 +35,7 @@ class CandidateStep:
 
 
 class EpisodeTracker:
-    """The pair that each environment runs and its return so far, at next to no cost for steps that end no episode."""
+    """The pair that each environment runs and its return so far."""
 
     def __init__(self, queue: list[Pair], n_envs: int, max_episode_steps: int):
         self.pairs = queue[:n_envs]

@@ -95,7 +95,6 @@ def collect(
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
     actor = actor_of(route, is_attached)
     as_env_actions = env_actions_of(policy)
-    # A copy: some VecEnvs reuse the array of the dones
     starts = [np.array(model._last_episode_starts, dtype=bool)]
     terminal_obs: TerminalObs = {}
     n_steps = first_row = 0
@@ -121,10 +120,11 @@ def collect(
         finally:
             # The callback finds s_t there, as with A2C; what it fails on may be s_{t+1}
             model._last_obs = new_obs  # type: ignore[assignment]
-        model._last_episode_starts = dones
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
+        # A copy as booleans: some VecEnvs return numbers, or reuse the array
         starts.append(dones.astype(bool))
+        model._last_episode_starts = starts[-1]
         n_steps += 1
         rollout_buffer.pos = n_steps
         if dones.any():
@@ -154,15 +154,13 @@ def collect(
 def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:
     """Store fractions where a Box has an integer dtype: ``VecNormalize`` and a Gaussian policy return floats."""
 
-    def made_float(rows: np.ndarray) -> np.ndarray:
-        return rows if np.issubdtype(rows.dtype, np.floating) else rows.astype(np.float32)
-
     def fitted(rows: np.ndarray, given: Any) -> np.ndarray:
-        return made_float(rows) if np.issubdtype(np.asarray(given).dtype, np.floating) else rows
+        gives_fractions = np.asarray(given).dtype.kind == "f" and rows.dtype.kind != "f"
+        return rows.astype(np.float32) if gives_fractions else rows
 
     buffer.observations = map_parts(fitted, buffer.observations, obs)
     if isinstance(action_space, spaces.Box):
-        buffer.actions = made_float(buffer.actions)
+        buffer.actions = fitted(buffer.actions, 0.0)
 
 
 def write_step(

@@ -40,7 +40,7 @@ def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | Non
 def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]], device: Any = "cpu") -> Columns:
     """Write the parts side by side into the buffer, as one process would with the environments of all."""
     all_columns = [columns for columns, _ in parts]
-    # A process without a quota has waited for the end of an episode that does not count
+    # A process without a quota has rows up to the first end of an episode, and none of them counts
     n_steps = max(len(columns.dones) for columns in all_columns if columns.quota.any())
     for name in ROWS:
         # A policy may refuse observations of zeros

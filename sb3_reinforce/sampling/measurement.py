@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
-from sb3_reinforce.envs.starts import separate, start_episodes
+from sb3_reinforce.envs.starts import give_new_seeds, start_episodes
 from sb3_reinforce.sampling.normalization import frozen
 
 
@@ -33,7 +33,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
         try:
             yield
         finally:
-            separate(env)
+            give_new_seeds(env)
         obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     model._last_obs = obs  # type: ignore[assignment]

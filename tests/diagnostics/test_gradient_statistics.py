@@ -17,7 +17,7 @@ from sb3_reinforce.diagnostics.statistics import (
     signal_to_noise,
     variance,
 )
-from sb3_reinforce.diagnostics.tables import as_text, interval, resamples
+from sb3_reinforce.diagnostics.tables import as_text, interval, resample_counts
 
 MEAN = th.tensor([1.0, -2.0, 0.5, 0.0, 1.5, 0.0, 1.0, -1.0], dtype=th.float64)
 FACTOR = th.randn(8, 8, dtype=th.float64, generator=th.Generator().manual_seed(3))
@@ -65,12 +65,12 @@ def test_ratios_are_each_others_inverse_and_no_signal_is_an_infinite_noise_scale
 
 
 def test_resamples_have_m_samples_of_which_two_differ():
-    counts = resamples(2, 200, seed=0)
+    counts = resample_counts(2, 200, seed=0)
     assert counts[0].tolist() == [1, 1]
     assert (counts.sum(1) == 2).all()
     assert ((counts > 0).sum(1) == 2).all()
-    assert th.equal(counts, resamples(2, 200, seed=0))
-    assert not th.equal(resamples(9, 5, seed=0), resamples(9, 5, seed=1))
+    assert th.equal(counts, resample_counts(2, 200, seed=0))
+    assert not th.equal(resample_counts(9, 5, seed=0), resample_counts(9, 5, seed=1))
 
 
 @pytest.mark.parametrize("m", [32, 64])
