@@ -55,6 +55,7 @@ ELSEWHERE = {
     r"torch\.distributed\.run": "tests/common/test_process_ends.py and tests/zoo/test_zoo_processes.py start it",
     r"processes\.py": "minutes: it starts eight processes for each row",
     r"^make (format|tables|test-lowest)$|-m slow$": "it changes files, or takes many minutes: by hand, or at night",
+    r"test_gpu\.py$": "it needs a GPU",
     r"^hf |^tensorboard |^python train\.py$|python -m sb3_reinforce\.zoo$": "a program of others, or no command",
 }
 IS_COMMAND = re.compile(r"(OMP_NUM_THREADS=1 )?(\S*python[\d.]*|\S*pip|make|hf|tensorboard|\.) \S|\.ci/run$")
