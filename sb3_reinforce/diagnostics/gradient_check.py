@@ -142,6 +142,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     }
 
 
+@np.errstate(under="ignore")
 def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: float, lam: float) -> np.ndarray:
     """
     ``G_t = (1 − λ) Σ_{n=1}^{N−1} λ^{n−1} G_{t:t+n} + λ^{N−1} G_{t:t+N}``, ``G_{t:t+n} = Σ_{k<n} γ^k r_{t+k} + γ^n V``,

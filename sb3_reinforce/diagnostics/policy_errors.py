@@ -65,22 +65,22 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     ``difference_error``, and a fifth of it with the last layer scaled up to outputs of about 1, if that is larger.
 
     The last layer of a new policy has small weights, with which the scores of the others hardly count. With larger
-    weights log π is curved more. Large logits are scaled down to 1: log π of an almost deterministic policy is mostly
-    rounding.
+    weights log π is curved more. Large logits, and their biases, are scaled down to 1: log π of an almost deterministic
+    policy is mostly rounding.
     """
-    layer = getattr(policy, "action_net", None)
-    if not isinstance(layer, th.nn.Linear):
-        return difference_error(policy, obs, actions)
-    size = size_of_outputs(layer, lambda: log_prob_of(policy, obs, actions))
+    net = getattr(policy, "action_net", None)
+    # It may stand in another module, as with a mask
+    layers = [each for each in net.modules() if isinstance(each, th.nn.Linear)] if isinstance(net, th.nn.Module) else []
+    size = size_of_outputs(layers[-1], lambda: log_prob_of(policy, obs, actions)) if layers else 0.0
     if size == 0:
         # Not the layer that the distribution comes from
         return difference_error(policy, obs, actions)
     scale = 1 / size
     are_logits = not isinstance(policy.action_space, spaces.Box)
-    with scaled(layer, min(1.0, scale) if are_logits else 1.0):
+    with scaled(layers[-1], min(1.0, scale) if are_logits else 1.0, are_logits):
         error = difference_error(policy, obs, actions)
     if scale > 1:
-        with scaled(layer, scale):
+        with scaled(layers[-1], scale, are_logits):
             error = max(error, difference_error(policy, obs, actions) / 5)
     return error
 
@@ -101,14 +101,18 @@ def size_of_outputs(layer: th.nn.Linear, evaluate: Callable[[], object]) -> floa
 
 
 @contextmanager
-def scaled(layer: th.nn.Linear, scale: float) -> Iterator[None]:
-    """Multiply the weights of a layer in the block."""
-    before = layer.weight.detach().clone()
-    write([layer.weight], (before * scale).flatten())
+def scaled(layer: th.nn.Linear, scale: float, are_logits: bool) -> Iterator[None]:
+    """Multiply the weights of a layer in the block, and scale biases of logits down to at most 1."""
+    parameters = [*layer.parameters()]
+    before = to_vector(parameters)
+    write([layer.weight], layer.weight.detach().flatten() * scale)
+    if are_logits and layer.bias is not None:
+        bias = layer.bias.detach()
+        write([layer.bias], bias / max(1.0, float(bias.abs().max())))
     try:
         yield
     finally:
-        write([layer.weight], before.flatten())
+        write(parameters, before)
 
 
 def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
@@ -175,8 +179,8 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
     """
     The largest difference between the mean of −log π over sampled actions and the entropy, in standard errors.
 
-    It is measured at a few of the ``n_obs`` observations, and is the smaller one of two samples, since rare actions may
-    be missing in one. An entropy without closed form is estimated from the sample, and there is no difference.
+    It is measured at a few of the ``n_obs`` observations, and is the smaller one of two samples, in one of which a rare
+    action may be too frequent. An entropy without closed form is estimated from the sample, and there is no difference.
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     errors = []
@@ -188,15 +192,17 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
         for _ in range(2):
             actions = draw(policy, one, n_draws)
             log_prob, entropy, _ = evaluate(policy, route_of(policy), many, actions, with_values=False)
-            pair.append(standard_errors((-log_prob - entropy).double()))
+            # Rare actions may be missing: E[(log π)²] ≥ H where −log π ≥ 1, and both add up over components
+            least = 0.0 if isinstance(policy.action_space, spaces.Box) else max(0.0, float(entropy.mean())) ** 0.5
+            pair.append(standard_errors((-log_prob - entropy).double(), least))
         errors.append(min(pair))
     return max(errors)
 
 
-def standard_errors(samples: th.Tensor) -> float:
-    """``|mean| / (std / √n)`` of n samples, ∞ where one is not finite."""
+def standard_errors(samples: th.Tensor, least_std: float) -> float:
+    """``|mean| / (std / √n)`` of n samples, with a std of at least ``least_std``; ∞ where one is not finite."""
     # Samples that are all equal differ by rounding
-    error = float(samples.mean().abs() / samples.std().clamp(min=1e-4)) * math.sqrt(len(samples))
+    error = float(samples.mean().abs() / samples.std().clamp(min=max(1e-4, least_std))) * math.sqrt(len(samples))
     return math.inf if math.isnan(error) else error
 
 

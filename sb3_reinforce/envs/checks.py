@@ -13,7 +13,7 @@ class BadData(ValueError):
 
 def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
     """
-    Check that numbers are finite. Their indices, after those in ``where``, begin with step and environment.
+    Check that numbers are finite. ``where``, followed by an element's indices, begins with step and environment.
 
     The step None is the present one.
     """

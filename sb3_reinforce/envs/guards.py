@@ -52,9 +52,10 @@ def forget_seeds(model: Any) -> None:
 
 @contextmanager
 def guard(env: VecEnv | None) -> Iterator[None]:
-    """Within the block, the environments below ``env`` and its wrappers are guarded."""
+    """Within the block, the environments below ``env`` and its wrappers are guarded, and numbers may underflow."""
     base = None if env is None else env.unwrapped
-    with ExitStack() as stack:
+    # γ^t becomes 0, also for users who let NumPy raise errors
+    with ExitStack() as stack, np.errstate(under="ignore"):
         # A subclass may have several environments behind one pipe
         if isinstance(base, SubprocVecEnv) and len(base.remotes) == base.num_envs:
             watch(base)

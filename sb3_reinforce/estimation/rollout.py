@@ -111,8 +111,6 @@ class Running:
         rewards = np.resize(self.rewards, len(starts))
         return Running(np.where(starts, 0, timesteps), np.where(starts, 0.0, rewards))
 
-    # γ^t may become 0, also for users who let NumPy raise errors
-    @np.errstate(under="ignore")
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
         timesteps = timesteps_of(dones, self.timesteps)

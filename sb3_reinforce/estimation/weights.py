@@ -27,8 +27,6 @@ from sb3_reinforce.estimation.rollout import (
 ROUNDING = 1e-12
 
 
-# γ^t may become 0, also for users who let NumPy raise errors
-@np.errstate(under="ignore")
 def complete_rollout(
     buffer: RolloutBuffer,
     policy: ActorCriticPolicy,

@@ -91,11 +91,13 @@ def collect(
     ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
+    # A user's own may be numbers
+    model._last_episode_starts = np.asarray(model._last_episode_starts, dtype=bool)
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
     actor = actor_of(route, is_attached)
     as_env_actions = env_actions_of(policy)
-    starts = [np.array(model._last_episode_starts, dtype=bool)]
+    starts = [model._last_episode_starts.copy()]
     terminal_obs: TerminalObs = {}
     n_steps = first_row = 0
     while n_steps < extent.n_steps and not extent.is_complete:
@@ -122,9 +124,9 @@ def collect(
             model._last_obs = new_obs  # type: ignore[assignment]
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
-        # A copy as booleans: some VecEnvs return numbers, or reuse the array
+        # Copies as booleans: some VecEnvs return numbers, or reuse the array
         starts.append(dones.astype(bool))
-        model._last_episode_starts = starts[-1]
+        model._last_episode_starts = starts[-1].copy()
         n_steps += 1
         rollout_buffer.pos = n_steps
         if dones.any():

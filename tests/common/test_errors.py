@@ -6,6 +6,9 @@ import torch as th
 from environments import Corridor
 from models import all_kinds, make, plain
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_reinforce.diagnostics import check_gradient
 
 NAN = float("nan")
 
@@ -36,13 +39,17 @@ def test_an_episode_longer_than_max_episode_steps_is_an_error():
 
 
 @pytest.mark.parametrize("reward", [1.0, 1e-41])
-@pytest.mark.parametrize("kwargs", [{"n_steps": 128}, {"n_episodes": 2}, {"n_episodes": 2, "reward_to_go": False}])
+@pytest.mark.parametrize(
+    "kwargs", [{"n_steps": 128}, {"n_steps": 400}, {"n_episodes": 2}, {"n_episodes": 2, "reward_to_go": False}]
+)
 def test_numbers_may_underflow_where_numpy_raises_errors(kwargs, reward):
     """γ^t and returns in float32, where a user looks for the source of a NaN by ``np.seterr(all="raise")``."""
-    env = Corridor((200,), lambda t, action: reward)
+    env = VecNormalize(make_vec_env(lambda: Corridor((200,), lambda t, action: reward)))
     kind = "episodes" if "n_episodes" in kwargs else "steps"
     with np.errstate(all="raise"):
-        assert make(kind, env, gamma=1e-3, discount_scores=True, **kwargs).learn(256)._n_updates >= 1
+        model = make(kind, env, gamma=1e-3, discount_scores=True, **kwargs).learn(256)
+        assert model._n_updates >= 1
+        check_gradient(model)
 
 
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():

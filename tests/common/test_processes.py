@@ -200,9 +200,10 @@ def test_processes_with_other_arguments_are_refused(name, tmp_path):
 def test_verbose_and_tensorboard_log_may_differ(tmp_path):
     def learn(rank):
         folder = str(tmp_path) if rank == 0 else None
-        return make("steps", corridors(1), verbose=1 - rank, tensorboard_log=folder).learn(32).num_timesteps
+        model = make("steps", corridors(1), verbose=1 - rank, tensorboard_log=folder).learn(32)
+        return model.num_timesteps, model.verbose
 
-    assert in_processes(2, learn, tmp_path) == [32, 32]
+    assert in_processes(2, learn, tmp_path) == [(32, 1), (32, 0)]
 
 
 def actions_of_all(rank, path):

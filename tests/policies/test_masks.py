@@ -156,7 +156,7 @@ def test_the_expected_gradient_is_that_of_the_expected_return(baseline, ragged):
     trajectories = tree.trajectories()
     log_probs = th.stack([log_prob(trajectory) for trajectory in trajectories])
     utilities = th.tensor([discounted_return(trajectory) for trajectory in trajectories])
-    true = th.nn.utils.parameters_to_vector(th.autograd.grad(log_probs.exp() @ utilities.double(), parameters))
+    true = th.nn.utils.parameters_to_vector(th.autograd.grad(log_probs.exp() @ utilities, parameters))
     assert GAMMA < 1 and float(true.norm()) > 0.1
     assert_equal(expectation(estimate, trajectories, log_probs.detach(), n_episodes), true)
 
