@@ -61,8 +61,7 @@ def seconds() -> str:
     lines = []
     for task, runs in final("comparison").query("seed < 5").groupby("task", sort=False):
         medians = runs.groupby("algorithm")["cpu_seconds"].median()
-        names = ("reinforce", *PEERS)
-        lines.append([task, *(number(medians[name], 0) if name in medians else NONE for name in names)])
+        lines.append([task, *(number(medians[name], 0) for name in ("reinforce", *PEERS))])
     return markdown(["task", "REINFORCE", "A2C", "PPO", "TRPO"], lines)
 
 
