@@ -26,12 +26,12 @@ __all__ = ["ALGORITHMS", "HYPERPARAMS", "Experiment"]
 rl_zoo3.ALGOS.update(ALGORITHMS)
 HYPERPARAMS_SAMPLER.update(
     reinforce=samplers.sample_reinforce,
-    reinforce_lstm=samplers.sample_reinforce,
+    reinforce_lstm=samplers.sample_reinforce_lstm,
     finite_difference=samplers.sample_finite_difference,
 )
 HYPERPARAMS_CONVERTER.update(
     reinforce=samplers.convert_reinforce,
-    reinforce_lstm=samplers.convert_reinforce,
+    reinforce_lstm=samplers.convert_reinforce_lstm,
     finite_difference=samplers.convert_finite_difference,
 )
 # The command train makes its experiment by this name

@@ -1,7 +1,10 @@
 """Model cards: ``python -m sb3_reinforce.zoo.model_card --algo reinforce --env CartPole-v1 -f agents``."""
 
 import argparse
+import importlib
+import shlex
 from pathlib import Path
+from typing import Any
 
 import yaml
 from rl_zoo3 import ALGOS, utils
@@ -9,6 +12,23 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
+
+# Options of ``train`` that change the result, and their names in ``args.yml``
+OPTIONS = {
+    "--algo": "algo",
+    "--env": "env",
+    "-n": "n_timesteps",
+    "-f": "log_folder",
+    "--seed": "seed",
+    "--conf-file": "conf_file",
+    "-params": "hyperparams",
+    "--env-kwargs": "env_kwargs",
+    "--gym-packages": "gym_packages",
+    "--trained-agent": "trained_agent",
+    "--storage": "storage",
+    "--study-name": "study_name",
+    "--trial-id": "trial_id",
+}
 
 CARD = """---
 library_name: stable-baselines3
@@ -28,7 +48,7 @@ python -m sb3_reinforce.zoo enjoy --algo {name} --env {env} -f {folder}
 ## Training
 
 ```sh
-python -m sb3_reinforce.zoo train --algo {name} --env {env} -n {timesteps} -f {folder} --seed {seed}
+{command}
 ```
 
 ## Hyperparameters
@@ -43,6 +63,8 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
     _, model, run = utils.get_model_path(0, folder, name, utils.EnvironmentName(env_id))
     saved = Path(run, env_id)
     arguments = yaml.unsafe_load((saved / "args.yml").read_text())
+    for package in arguments["gym_packages"]:
+        importlib.import_module(package)
     settings = dict(yaml.unsafe_load((saved / "config.yml").read_text()))
     hyperparams, stats = utils.get_saved_hyperparams(str(saved), test_mode=True)
     env_kwargs = arguments["env_kwargs"] or settings.get("env_kwargs")
@@ -53,9 +75,11 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
     agent = ALGOS[name].load(model, env=env)
     mean, std = evaluate_policy(agent, env, n_episodes)
     env.close()
+    arguments["n_timesteps"] = max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"])
     path = Path(run, "README.md")
     card = CARD.format(
         algorithm=type(agent).__name__,
+        command=training_command(arguments),
         env=env_id,
         folder=folder,
         mean=mean,
@@ -64,10 +88,22 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
         seed=arguments["seed"],
         settings=yaml.dump(settings),
         std=std,
-        timesteps=max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"]),
     )
     path.write_text(card)
     return path
+
+
+def training_command(arguments: dict[str, Any]) -> str:
+    """``train`` with the arguments that the Zoo has saved, as far as they change the result."""
+    command = ["python", "-m", "sb3_reinforce.zoo", "train"]
+    for option, name in OPTIONS.items():
+        value = arguments[name]
+        if isinstance(value, dict):
+            value = [f"{key}:{part!r}" for key, part in value.items()]
+        words = value if isinstance(value, list) else [str(value)]
+        if value not in (None, "", []):
+            command += [option, *words]
+    return shlex.join(command)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ A trial stores the suggested values, such as a power of two; ``train --trial-id`
 import optuna
 from rl_zoo3.hyperparams_opt import convert_onpolicy_params
 
+from sb3_reinforce.policies.memories import MEMORIES
 from sb3_reinforce.zoo.settings import Settings
 
 
@@ -16,6 +17,21 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
 
     Configured ``policy_kwargs``, ``reward_to_go`` and ``episodes_per_start`` are replaced.
     """
+    return convert_reinforce(suggest_reinforce(trial, n_envs))
+
+
+def sample_reinforce_lstm(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+    """As ``sample_reinforce``, with a memory."""
+    memory = {
+        "memory": trial.suggest_categorical("memory", [*MEMORIES]),
+        "lstm_hidden_size_pow": trial.suggest_int("lstm_hidden_size_pow", 4, 8),
+        "enable_critic_lstm": trial.suggest_categorical("enable_critic_lstm", [False, True]),
+    }
+    return convert_reinforce_lstm({**suggest_reinforce(trial, n_envs), **memory})
+
+
+def suggest_reinforce(trial: optuna.Trial, n_envs: int) -> Settings:
+    """The values of a trial of REINFORCE."""
     sampled: Settings = {
         "baseline": trial.suggest_categorical("baseline", ["value", "leave_one_out", "time_mean", "optimal"]),
         "step": trial.suggest_categorical("step", ["optimizer", "natural"]),
@@ -41,7 +57,7 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
         sampled["one_minus_gae_lambda"] = trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True)
         sampled["batch_size_pow"] = trial.suggest_int("batch_size_pow", 5, 9)
         sampled["n_critic_updates"] = trial.suggest_int("n_critic_updates", 1, 20, log=True)
-    return convert_reinforce(sampled)
+    return sampled
 
 
 def convert_reinforce(sampled_params: Settings) -> Settings:
@@ -54,6 +70,16 @@ def convert_reinforce(sampled_params: Settings) -> Settings:
     arguments |= {"reward_to_go": True, "episodes_per_start": 1}
     if "n_episodes_pow" in arguments:
         arguments["n_episodes"] = 2 ** arguments.pop("n_episodes_pow")
+    return arguments
+
+
+def convert_reinforce_lstm(sampled_params: Settings) -> Settings:
+    """Convert the values of a trial to arguments of RecurrentREINFORCE."""
+    values = dict(sampled_params)
+    memory = {name: values.pop(name) for name in ("memory", "enable_critic_lstm")}
+    memory["lstm_hidden_size"] = 2 ** values.pop("lstm_hidden_size_pow")
+    arguments = convert_reinforce(values)
+    arguments["policy_kwargs"] |= memory
     return arguments
 
 

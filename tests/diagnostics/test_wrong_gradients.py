@@ -9,10 +9,12 @@ from environments import Tree
 from gradient_checks import ACTION_SPACES, HalfDetached, corridor, with_noise
 from gymnasium import spaces
 from models import FromDistribution
+from sb3_contrib.common.envs import InvalidActionEnvDiscrete
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.diagnostics import check_gradient
 from sb3_reinforce.diagnostics.policy_errors import sampling_error
 from sb3_reinforce.estimation import weights
@@ -185,13 +187,36 @@ def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
     assert "sampling" in check_gradient(model, seed=seed).failures
 
 
-def test_a_rare_action_is_no_false_alarm():
-    """Of two actions, one with a probability of 0.006, which varies by half of its frequency in a sample."""
-    model = REINFORCE("MlpPolicy", corridor(spaces.Discrete(2)), device="cpu", seed=0)
+@pytest.mark.parametrize("logit", [5.11, 8.1, 11.5])
+@pytest.mark.parametrize("action_space", [spaces.Discrete(2), spaces.MultiDiscrete([2, 2, 2])])
+def test_a_rare_action_is_no_false_alarm(action_space, logit):
+    """One with a probability of 0.006, 3e-4 or 1e-5, which comes twice as often as expected, or never."""
+    model = REINFORCE("MlpPolicy", corridor(action_space), device="cpu", seed=0)
     with th.no_grad():
-        model.policy.action_net.bias.copy_(th.tensor([5.11, 0.0]))
+        model.policy.action_net.bias[::2] = logit
     th.manual_seed(0)
     assert max(sampling_error(model.policy, th.eye(7), 7) for _ in range(50)) < 5
+    table = check_gradient(model)
+    assert table["scores"].passed and table["sampling"].passed
+
+
+class DetachedFeatures(FlattenExtractor):
+    """Its layer gets no gradient."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.linear = th.nn.Linear(self.features_dim, self.features_dim)
+
+    def forward(self, observations):
+        return self.linear(super().forward(observations)).detach()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_layer_without_a_gradient_is_seen_also_behind_a_mask(seed):
+    env = make_vec_env(lambda: ActionMaskObservation(InvalidActionEnvDiscrete(20, n_invalid_actions=10)), 2, seed=0)
+    kwargs = {"features_extractor_class": DetachedFeatures}
+    model = REINFORCE(MaskedPolicy, env, device="cpu", seed=seed, policy_kwargs=kwargs)
+    assert check_gradient(model, seed=seed).failures == ["scores"]
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", NEGATED])

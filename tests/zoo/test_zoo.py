@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import gymnasium as gym
 import pytest
 import rl_zoo3
 import stable_baselines3
+import torch as th
 import yaml
 from huggingface_hub.errors import HTTPError
 from matplotlib import pyplot
@@ -67,6 +69,22 @@ def test_a_model_card_names_the_classes_of_the_settings(tmp_path):
     assert "activation.ReLU" in write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
 
 
+def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
+    folder = ("-f", str(tmp_path))
+    settings = ("learning_rate:0.01", "policy_kwargs:dict(net_arch=[8])")
+    train("reinforce", "-n", "64", *folder, "-params", *settings, "--env-kwargs", "sutton_barto_reward:True")
+    card = write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
+    command = re.search(r"^python -m sb3_reinforce.zoo (train .*)$", card, re.M)[1]
+    zoo(*shlex.split(command))
+    first, second = [tmp_path / "reinforce" / f"CartPole-v1_{number}" for number in (1, 2)]
+    assert config_of(first) == config_of(second)
+    states = [
+        ALGORITHMS["reinforce"].load(run / "CartPole-v1.zip", device="cpu").policy.state_dict().values()
+        for run in (first, second)
+    ]
+    assert all(map(th.equal, *states))
+
+
 @pytest.mark.parametrize("name", ["reinforce", "finite_difference"])
 def test_record_video_also_of_an_environment_of_another_package(name, tmp_path, monkeypatch):
     pytest.importorskip("pygame")
@@ -79,6 +97,9 @@ def test_record_video_also_of_an_environment_of_another_package(name, tmp_path, 
     common = ("--algo", name, "--env", "Own-v0", "--gym-packages", "own_envs", "-f", str(tmp_path), "-n", "40")
     zoo("train", *common)
     zoo("record_video", *common, "-o", str(tmp_path / "videos"))
+    gym.registry.pop("Own-v0")
+    monkeypatch.delitem(sys.modules, "own_envs")
+    assert "--gym-packages own_envs" in write_card(str(tmp_path), name, "Own-v0", n_episodes=2).read_text()
     gym.registry.pop("Own-v0")
     assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 

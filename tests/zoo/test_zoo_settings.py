@@ -17,6 +17,7 @@ from sb3_contrib.common.wrappers import ActionMasker
 from zoo_commands import RUN, config_of, message_of, train, zoo
 
 from sb3_reinforce import ActionMaskObservation
+from sb3_reinforce.policies.memories import MEMORIES
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 
 SCHEDULED = {
@@ -178,6 +179,7 @@ def test_optuna_tunes_and_its_trials_can_be_trained(name, tmp_path, monkeypatch,
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    memories = set()
     published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
     for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
         settings = published.get(entry, published["default"])
@@ -189,8 +191,11 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
             trial = study.ask()
             sample = HYPERPARAMS_SAMPLER[name](trial, 1, 8, {})
             assert HYPERPARAMS_CONVERTER[name](trial.params) == sample
+            if name == "reinforce_lstm":
+                memories.add(sample["policy_kwargs"]["memory"])
             model = ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
             assert name == "finite_difference" or model.n_episodes is None or model.n_episodes >= 8
+    assert memories == ({*MEMORIES} if name == "reinforce_lstm" else set())
 
 
 ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
