@@ -181,9 +181,10 @@ def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """A step of ``train()`` by SGD, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π / denominator``."""
+    """A step of ``train()`` by SGD, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π`` over steps or episodes."""
     gradients = gradients_by_episode(rollout, training_weights(collector))[0]
-    expected = gradients.sum(0) / rollout.denominator
+    by_steps = collector.normalize_by == "steps"
+    expected = gradients.sum(0) / (int(rollout.used.sum()) if by_steps else len(rollout.used_episodes))
     parameters = parameters_of(rollout)
     before = to_vector(parameters)
     # As long as θ if the gradient is shorter: a short step would drown in the rounding of θ

@@ -100,6 +100,15 @@ class WrongWeights(REINFORCE):
         return going_on
 
 
+class WrongDenominator(REINFORCE):
+    """Divides by twice the number of steps."""
+
+    def collect_rollouts(self, *args, **kwargs):
+        going_on = super().collect_rollouts(*args, **kwargs)
+        self.rollout = replace(self.rollout, denominator=2 * self.rollout.denominator)
+        return going_on
+
+
 class TwoSteps(REINFORCE):
     """Takes a second step from the same data."""
 
@@ -125,6 +134,7 @@ def failures(algorithm=REINFORCE, policy="MlpPolicy"):
         ({"policy": HalfDetached}, ["scores"]),
         ({"algorithm": WrongReturns}, ["returns", "weights"]),
         ({"algorithm": WrongWeights}, ["weights"]),
+        ({"algorithm": WrongDenominator}, ["surrogate"]),
         ({"algorithm": TwoSteps}, ["surrogate"]),
     ],
 )
