@@ -54,6 +54,8 @@ class GymnasiumVecEnv(VecEnv):
         if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
         obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
+        if not isinstance(infos, dict):
+            raise ValueError(f"{self.env} must return infos as a dict of arrays, not as a {type(infos).__name__}")
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -68,6 +70,9 @@ class GymnasiumVecEnv(VecEnv):
         """Make the step; malformed observations and rewards are refused."""
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
         rewards = np.asarray(rewards)
+        # As a mask, zeros and ones would be the numbers of copies
+        terminated = np.asarray(terminated, dtype=bool)
+        truncated = np.asarray(truncated, dtype=bool)
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
             raise BadData(f"The rewards must be {self.num_envs} numbers, one an environment, got {rewards.tolist()}")
         check_batch(self.observation_space, obs, self.num_envs)

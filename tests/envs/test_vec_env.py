@@ -8,7 +8,7 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import TransformAction, TransformReward
-from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
 from models import make
 from packaging.version import Version
 from stable_baselines3 import A2C, PPO
@@ -252,6 +252,45 @@ def test_malformed_steps_are_named(change, message, wrapper):
     with pytest.raises(ValueError, match=rf"{message}.*num_timesteps=27\)"):
         model.learn(100)
     assert model.learn(100).num_timesteps >= 100
+
+
+class Numbers(SyncVectorEnv):
+    """Ends episodes by numbers, and resets copies as vectorized environments do, by a mask of an array."""
+
+    form = staticmethod(np.asarray)
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, infos = super().step(actions)
+        return obs, rewards, self.form(terminated.astype(int)), self.form(truncated.astype(int)), infos
+
+    def reset(self, *, seed=None, options=None):
+        if options is not None:
+            # Which copies the mask selects, if it is used as an index
+            wanted = np.zeros(self.num_envs, dtype=bool)
+            wanted[options["reset_mask"]] = True
+            options = {"reset_mask": wanted}
+        return super().reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize("form", [np.asarray, list])
+def test_episodes_may_end_by_numbers(form):
+    plain, numbers = [
+        GymnasiumVecEnv(kind([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=AutoresetMode.DISABLED))
+        for kind in (SyncVectorEnv, Numbers)
+    ]
+    numbers.env.form = form
+    for env in (plain, numbers):
+        env.seed(0)
+        env.reset()
+    for _ in range(30):
+        for ours, theirs in zip(step(numbers)[:3], step(plain)[:3], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_list_of_infos_is_refused():
+    env = SyncVectorEnv([Corridor] * N_ENVS, autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(ValueError, match="must return infos as a dict of arrays, not as a list"):
+        GymnasiumVecEnv(DictInfoToList(env)).reset()
 
 
 @pytest.mark.parametrize("form", [list, lambda obs: obs.astype(np.float64)])
