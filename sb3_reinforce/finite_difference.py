@@ -268,8 +268,8 @@ class FiniteDifference(BasePolicyGradient):
         """
         Perturb θ, evaluate the candidates and estimate ∇U(θ). The policy stays as it is.
 
-        ``learn`` calls it. After a call of your own seed the environments again (``env.seed``): with common random
-        numbers all have the seed of the last candidates.
+        ``learn`` calls it. If you call it yourself, seed the environments again afterwards (``env.seed``): with common
+        random numbers all have the seed of the last candidates.
 
         :param callback: Called at each step, and at the beginning and end of the rollout, after ``init_callback``
         :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them

@@ -181,7 +181,7 @@ def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """A step of ``train()`` by SGD, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π`` divided by D."""
+    """A step of ``train()`` by SGD, without entropy bonus and clipping, against the mean of ``w_t ∇ log π``."""
     gradients = gradients_by_episode(rollout, training_weights(collector))[0]
     by_steps = collector.normalize_by == "steps"
     expected = gradients.sum(0) / (int(rollout.used.sum()) if by_steps else len(rollout.used_episodes))

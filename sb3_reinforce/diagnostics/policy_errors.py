@@ -68,9 +68,9 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     weights log π is curved more. Large logits, and their biases, are scaled down to 1: log π of an almost deterministic
     policy is mostly rounding.
     """
-    net = getattr(policy, "action_net", None)
     # It may stand in another module, as with a mask
-    layers = [each for each in net.modules() if isinstance(each, th.nn.Linear)] if isinstance(net, th.nn.Module) else []
+    parts = [part for name, part in policy.named_modules() if name.split(".")[0] == "action_net"]
+    layers = [part for part in parts if isinstance(part, th.nn.Linear)]
     size = size_of_outputs(layers[-1], lambda: log_prob_of(policy, obs, actions)) if layers else 0.0
     if size == 0:
         # Not the layer that the distribution comes from
@@ -192,8 +192,9 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
         for _ in range(2):
             actions = draw(policy, one, n_draws)
             log_prob, entropy, _ = evaluate(policy, route_of(policy), many, actions, with_values=False)
-            # Rare actions may be missing: E[(log π)²] ≥ H where −log π ≥ 1; above 0.2² the others vary enough
-            least = 0.0 if isinstance(policy.action_space, spaces.Box) else float(entropy.mean().clamp(0, 0.04).sqrt())
+            # Below 0.1 nats a sample may lack the rare actions, with which the variance of log π is at least H
+            h = 0.0 if isinstance(policy.action_space, spaces.Box) else float(entropy.mean())
+            least = math.sqrt(h) if 0 < h < 0.1 else 0.0
             pair.append(standard_errors((-log_prob - entropy).double(), least))
         errors.append(min(pair))
     return max(errors)

@@ -91,7 +91,7 @@ def collect(
     ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
-    # A user's own may be numbers
+    # A user may have set numbers
     model._last_episode_starts = np.asarray(model._last_episode_starts, dtype=bool)
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -25,10 +26,9 @@ OPTIONS = {
     "--env-kwargs": "env_kwargs",
     "--gym-packages": "gym_packages",
     "--trained-agent": "trained_agent",
-    "--storage": "storage",
-    "--study-name": "study_name",
-    "--trial-id": "trial_id",
 }
+
+CLASS = re.compile(r"<class ('[\w.]+')>")
 
 CARD = """---
 library_name: stable-baselines3
@@ -76,6 +76,10 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
     mean, std = evaluate_policy(agent, env, n_episodes)
     env.close()
     arguments["n_timesteps"] = max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"])
+    arguments["log_folder"] = folder
+    if arguments["trial_id"] is not None:
+        # Those of the trial, whose study others do not have
+        arguments["hyperparams"] = settings
     path = Path(run, "README.md")
     card = CARD.format(
         algorithm=type(agent).__name__,
@@ -97,9 +101,10 @@ def training_command(arguments: dict[str, Any]) -> str:
     """``train`` with the arguments that the Zoo has saved, as far as they change the result."""
     command = ["python", "-m", "sb3_reinforce.zoo", "train"]
     for option, name in OPTIONS.items():
-        value = arguments[name]
+        value = arguments.get(name)
         if isinstance(value, dict):
-            value = [f"{key}:{part!r}" for key, part in value.items()]
+            # The Zoo finds a class by its path
+            value = [f"{key}:" + CLASS.sub(r"get_class_by_name(\1)", repr(part)) for key, part in value.items()]
         words = value if isinstance(value, list) else [str(value)]
         if value not in (None, "", []):
             command += [option, *words]

@@ -22,12 +22,12 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
 
 def sample_reinforce_lstm(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
     """As ``sample_reinforce``, with a memory."""
-    memory = {
-        "memory": trial.suggest_categorical("memory", [*MEMORIES]),
-        "lstm_hidden_size_pow": trial.suggest_int("lstm_hidden_size_pow", 4, 8),
-        "enable_critic_lstm": trial.suggest_categorical("enable_critic_lstm", [False, True]),
-    }
-    return convert_reinforce_lstm({**suggest_reinforce(trial, n_envs), **memory})
+    sampled = suggest_reinforce(trial, n_envs)
+    sampled["memory"] = trial.suggest_categorical("memory", [*MEMORIES])
+    sampled["lstm_hidden_size_pow"] = trial.suggest_int("lstm_hidden_size_pow", 4, 8)
+    if sampled["baseline"] == "value":
+        sampled["enable_critic_lstm"] = trial.suggest_categorical("enable_critic_lstm", [False, True])
+    return convert_reinforce_lstm(sampled)
 
 
 def suggest_reinforce(trial: optuna.Trial, n_envs: int) -> Settings:
@@ -76,7 +76,7 @@ def convert_reinforce(sampled_params: Settings) -> Settings:
 def convert_reinforce_lstm(sampled_params: Settings) -> Settings:
     """Convert the values of a trial to arguments of RecurrentREINFORCE."""
     values = dict(sampled_params)
-    memory = {name: values.pop(name) for name in ("memory", "enable_critic_lstm")}
+    memory: Settings = {name: values.pop(name) for name in ("memory", "enable_critic_lstm") if name in values}
     memory["lstm_hidden_size"] = 2 ** values.pop("lstm_hidden_size_pow")
     arguments = convert_reinforce(values)
     arguments["policy_kwargs"] |= memory

@@ -177,6 +177,13 @@ class Greedy(ActorCriticPolicy):
         return actions, values, self.evaluate_actions(obs, actions)[1]
 
 
+class Mode(ActorCriticPolicy):
+    """Takes the most likely action, also where all are nearly as likely."""
+
+    def forward(self, obs, deterministic=False):
+        return super().forward(obs, deterministic=True)
+
+
 class Warm(ActorCriticPolicy):
     """Samples with twice the standard deviation that it reports."""
 
@@ -193,8 +200,9 @@ def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
         with th.no_grad():
             model.policy.action_net.bias[0] = 2.0
         assert check_gradient(model, seed=seed).failures == ([] if is_right else ["sampling"])
-    model = REINFORCE(Warm, corridor(spaces.Box(-1, 1, (2,))), baseline="mean", device="cpu", seed=seed)
-    assert "sampling" in check_gradient(model, seed=seed).failures
+    for policy, action_space in ((Warm, spaces.Box(-1, 1, (2,))), (Mode, spaces.Discrete(3))):
+        model = REINFORCE(policy, corridor(action_space), baseline="mean", device="cpu", seed=seed)
+        assert "sampling" in check_gradient(model, seed=seed).failures
 
 
 @pytest.mark.parametrize("logit", [5.11, 8.1, 11.5])

@@ -257,8 +257,6 @@ def test_malformed_steps_are_named(change, message, wrapper):
 class Numbers(SyncVectorEnv):
     """Ends episodes by numbers, and resets copies as vectorized environments do, by a mask of an array."""
 
-    form = staticmethod(np.asarray)
-
     def step(self, actions):
         obs, rewards, terminated, truncated, infos = super().step(actions)
         return obs, rewards, self.form(terminated.astype(int)), self.form(truncated.astype(int)), infos

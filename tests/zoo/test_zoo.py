@@ -71,7 +71,7 @@ def test_a_model_card_names_the_classes_of_the_settings(tmp_path):
 
 def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
     folder = ("-f", str(tmp_path))
-    settings = ("learning_rate:0.01", "policy_kwargs:dict(net_arch=[8])")
+    settings = ("learning_rate:0.01", "policy_kwargs:dict(net_arch=[8],activation_fn=nn.ReLU)")
     train("reinforce", "-n", "64", *folder, "-params", *settings, "--env-kwargs", "sutton_barto_reward:True")
     card = write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
     command = re.search(r"^python -m sb3_reinforce.zoo (train .*)$", card, re.M)[1]
