@@ -107,8 +107,7 @@ def scaled(layer: th.nn.Linear, scale: float, are_logits: bool) -> Iterator[None
     before = to_vector(parameters)
     write([layer.weight], layer.weight.detach().flatten() * scale)
     if are_logits and layer.bias is not None:
-        bias = layer.bias.detach()
-        write([layer.bias], bias / max(1.0, float(bias.abs().max())))
+        write([layer.bias], layer.bias.detach() / max(1.0, float(layer.bias.detach().abs().max())))
     try:
         yield
     finally:
