@@ -60,11 +60,10 @@ class FiniteDifference(BasePolicyGradient):
     searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward pass,
     other policies one after the other.
 
-    With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and
-    the observations seen join them afterwards; the first update has the scale of the first observations. Utilities are
-    sums of the rewards before any scaling by it. If a wrapper above it may change rewards (one that Stable-Baselines3
-    does not have), they are sums of that wrapper's rewards, and VecNormalize must not learn their scale
-    (``norm_reward=False`` or ``training=False``).
+    With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and the
+    observations seen join them afterwards; the first update has the scale of the first observations. Utilities are sums
+    of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of that
+    wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -82,15 +81,15 @@ class FiniteDifference(BasePolicyGradient):
     :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
         the start from differences, but environments idle until the longest episode of a round ends
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
-    :param standardize_utilities: Measure the gradient in standard deviations of all utilities (ARS: of those that
-        ``n_top`` leaves) per ``delta_std``: the step then depends neither on the scale of the rewards nor on
-        ``delta_std``
+    :param standardize_utilities: Divide the gradient by the standard deviation of all utilities (ARS: of those that
+        ``n_top`` leaves) and multiply it by ``delta_std``: the step then depends neither on the scale of the rewards
+        nor on ``delta_std``
     :param deterministic: Whether candidates take their most likely actions, or sample
     :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
     :param max_episode_steps: The length beyond which an episode raises an error
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
-    :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation; the dictionary is not modified
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run
@@ -232,6 +231,7 @@ class FiniteDifference(BasePolicyGradient):
         :param reset_num_timesteps: Whether to start the counts of steps and episodes from zero
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
+        :raises TypeError: If an argument is of the wrong type
         :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
             finite, a design cannot be solved, or an episode does not end. The policy is the last good one
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one

@@ -62,18 +62,18 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
-    (Williams, 1992, equation 4 and theorem 1; γ^t only with ``discount_scores``). m_t is 1 for the steps that are used:
-    those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
-    ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"`` or
-    ``"leave_one_out"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no normalization or
-    clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
-    gradient where the noise depends on the features. So are dropout and batch normalization, with which the policy that
-    is trained is not the one that acts, as in A2C.
+    (Williams, 1992, equation 4 and theorems 1 and 2; γ^t only with ``discount_scores``). m_t is 1 for the steps that
+    are used: those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
+    ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"``,
+    ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no
+    normalization or clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and
+    Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout and batch normalization,
+    with which the policy that is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
-    left out, since its return is not known. The value network is then not used, and evaluated only by a policy that
-    overrides ``forward``, ``evaluate_actions`` or ``extract_features``.
+    left out, since its return is not known. Then only policies with hooks, or with their own ``forward``,
+    ``evaluate_actions`` or ``extract_features``, evaluate the value network.
 
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
     A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,
@@ -87,8 +87,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         32 steps for ``baseline="value"``, for the others 16 episodes, or one of each environment if there are more
         (with ``episodes_per_start``, always one of each)
     :param gamma: Discount factor
-    :param gae_lambda: λ of the λ-return G_t: 1 is Monte Carlo, 0 the TD residual. Below 1 only with
-        ``baseline="value"`` and ``reward_to_go=True``
+    :param gae_lambda: λ of the λ-return G_t: 1 is the Monte Carlo return, 0 the one-step return r_t + γ V(s_{t+1}).
+        Below 1 only with ``baseline="value"`` and ``reward_to_go=True``
     :param ent_coef: Weight of the entropy in the objective, it can be a schedule
     :param vf_coef: Weight of the critic's squared error in the optimizer's step, where a features extractor is shared
     :param max_grad_norm: Bound on the norm of a step's gradient, separately for actor and critic; None or inf for
@@ -123,13 +123,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param normalize_advantage: Scale G_t − b_t to mean 0 and standard deviation 1 per rollout; skipped below two
         samples and where the deviation is 0
     :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
-        (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. It takes
-        rollouts of a thousand steps or more, and a policy without dropout and batch normalization
-    :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout, before
-        ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
+        (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of
+        a thousand steps or more. Policies with dropout or batch normalization are refused
+    :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout (at
+        most 1.2 times it), before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
-    :param policy_kwargs: Additional arguments to be passed to the policy on creation; never written to
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation; the dictionary is not modified
     :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run
@@ -535,6 +535,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             begin with a reset
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
+        :raises TypeError: If an argument is of the wrong type
         :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, PyTorch's gradients are
             turned off, its default device is not the CPU, or processes under torchrun have different arguments; and as
             in ``collect_rollouts`` and ``train``

@@ -70,9 +70,9 @@ def compare_baselines(
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: A table with one ``BaselineRow`` per baseline
     :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
-    :raises ValueError: If there are too few episodes, a name is unknown or used twice, ``"value"`` is given without a
-        critic, the reference is not among the baselines, or the episodes are not independent because they share the
-        noise of gSDE
+    :raises ValueError: If an argument is out of its range, a name is unknown or used twice, ``"value"`` is given
+        without a critic, the reference is not among the baselines, or the episodes are not independent because they
+        share the noise of gSDE
     """
     check_model(model, independent=True)
     functions = functions_of(model, baselines)

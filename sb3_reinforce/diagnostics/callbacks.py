@@ -64,8 +64,8 @@ class GradientQualityCallback(Diagnosis):
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
     rollout and are noisy if it has few episodes. With fewer than two only the cosine is logged, and while the actor is
     frozen nothing. A measurement costs about one forward and 1 + (number of baselines) backward passes over at most
-    ``max_episodes`` episodes, two more with ``"optimal"``, and as much again for each 256 MiB of their gradients.
-    Nothing is sampled for it, and training is the same with and without it.
+    ``max_episodes`` episodes, two more with ``"optimal"``, and the same again for every 256 MiB that the gradients
+    take. Nothing is sampled for it, and training is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic

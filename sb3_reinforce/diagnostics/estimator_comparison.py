@@ -71,8 +71,8 @@ def compare_estimators(
     θ is the actor's parameters without ``log_std``. One estimate is one episode with reward-to-go and the leave-one-out
     baseline for the likelihood ratio, and ``n_delta`` perturbations with one episode per utility for the others. The
     signal-to-noise ratio of a mean of estimates is proportional to their number, so the ratio per step does not depend
-    on the size of an estimate. With fewer perturbations than parameters a difference only sees their span: its
-    expectation is a multiple of the gradient, and the cosine refers to the expectation.
+    on the size of an estimate. With fewer perturbations than parameters an estimate lies in their span. Its
+    expectation is a multiple of the gradient, and the cosine is that of the expectation.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes of the likelihood ratio, and as many again for the reference gradient, at least 3
@@ -80,9 +80,9 @@ def compare_estimators(
     :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
     :param perturbation: As for FiniteDifference. A difference solved for as many Gaussian perturbations as parameters
         is mostly noise, because these are nearly linearly dependent; coordinates are not
-    :param n_delta: As for FiniteDifference; None for the rule of thumb
-    :param delta_std: As for FiniteDifference; None for its rule of thumb. A utility from a single episode is too noisy
-        for steps as small as in training, so the default is larger
+    :param n_delta: As for FiniteDifference, but at least 2; None for the rule of thumb
+    :param delta_std: A number as for FiniteDifference; None for its rule of thumb. A utility from a single episode is
+        too noisy for steps as small as in training, so the default is larger
     :param n_resamples: Number of bootstrap resamples
     :param confidence: Probability with which an interval should cover the true value
     :param seed: Seed of perturbations, episodes (also of the environments) and resamples

@@ -86,15 +86,16 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     - ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
-    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails: Stable-Baselines3
-    detaches the features on which the standard deviation depends, unless ``policy.action_dist.learn_features`` is set.
+    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE and hidden layers ``scores`` fails:
+    Stable-Baselines3 detaches the features on which the standard deviation depends, unless
+    ``policy.action_dist.learn_features`` is set.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Number of episodes, at least 2
     :param seed: Seed of the actions and of the directions of the finite differences
     :return: A table with one ``CheckRow`` per item; ``.passed`` is True if all of them pass
     :raises TypeError: If the model is not a REINFORCE
-    :raises ValueError: If there are too few episodes, or log π cannot be differentiated
+    :raises ValueError: If an argument is out of its range, or log π cannot be differentiated
     """
     check_model(model)
     check_integer("n_episodes", n_episodes, 2)

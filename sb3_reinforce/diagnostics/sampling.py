@@ -30,7 +30,8 @@ def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progr
 
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
-    :param baseline: The baseline to collect with; None for ``"value"`` if the model has a critic, else ``"none"``
+    :param baseline: The baseline to collect with, a name or a function; None for ``"value"`` if the model has a critic,
+        else ``"none"``
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The rollout; it has ``values`` only if the baseline is ``"value"``
     :raises TypeError: If the model is not a REINFORCE

@@ -2,8 +2,8 @@
 Baselines: what is subtracted from the return before it weights a score. One pure function each.
 
 A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. It keeps the gradient unbiased as long as
-b_t does not depend on the action at t or on its consequences (Williams, 1992, theorem 1). A user's own function is a
-baseline too.
+b_t does not depend on the action at t or on its consequences (Williams, 1992, theorems 1 and 2). A user's own function
+is a baseline too.
 
 "Other episodes" are the others of the same group: of the rollout, or with ``episodes_per_start`` of the same start.
 ``mean`` always takes all.

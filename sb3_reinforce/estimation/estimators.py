@@ -137,8 +137,8 @@ class Fit:
     :param r_squared: Share of their variance within columns that ``u₀ + δ · ĝ`` explains; NaN where there is none
     :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
     :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None where the
-        evaluations do not determine every component and leave a degree of freedom. That of forward differences,
-        which share the noise of U(θ), is larger, and with ``n_top`` ĝ is another fit
+        evaluations do not determine every component and leave a degree of freedom. It is too small for forward
+        differences, which share the noise of U(θ), and without a meaning for ``n_top``, where ĝ is another fit
     """
 
     r_squared: float
@@ -158,7 +158,7 @@ def fit_quality(
     :param utilities: Their utilities, shape ``(m,)``, float64
     :param gradient: ĝ, shape ``(n,)``
     :param columns: The column of each candidate, counted from 0, shape ``(m,)``; None for one column
-    :return: The three of them
+    :return: R², s and the standard errors
     """
     if columns is None:
         columns = th.zeros(len(utilities), dtype=th.long)

@@ -30,7 +30,8 @@ class Rollout:
     :param timesteps: t within the episode, int64
     :param used: Whether the step enters the gradient (m_t), bool
     :param returns: G_t, float64
-    :param discounts: The factor of the score besides G_t − b_t: γ^t with ``discount_scores``, else 1; float64
+    :param discounts: The factor of the score besides G_t − b_t: γ^t with ``discount_scores`` and
+        ``reward_to_go``, else 1; float64
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``
     :param policy: The policy that acted, with the parameters with which it acted
     :param denominator: What the sum over all steps is divided by

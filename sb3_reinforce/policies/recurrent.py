@@ -26,12 +26,13 @@ class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
 
     The arguments below are given as ``policy_kwargs``. With ``ortho_init``, recurrent weights start orthogonal too.
 
-    :param memory: ``"lstm"``, ``"gru"`` (Cho et al., 2014) or ``"rnn"`` (an Elman network, 1990)
-    :param lstm_hidden_size: Hidden units of each layer
-    :param n_lstm_layers: Number of layers
-    :param enable_critic_lstm: Whether the critic has a separate memory
-    :param shared_lstm: Whether the critic reads the actor's memory, without training it
+    :param memory: ``"lstm"`` (default), ``"gru"`` (Cho et al., 2014) or ``"rnn"`` (an Elman network, 1990)
+    :param lstm_hidden_size: Hidden units of each layer, 256 by default
+    :param n_lstm_layers: Number of layers, 1 by default
+    :param enable_critic_lstm: Whether the critic has a separate memory, True by default
+    :param shared_lstm: Whether the critic reads the actor's memory, without training it; False by default
     :param lstm_kwargs: ``bias``, ``dropout``, and ``nonlinearity`` of ``"rnn"``
+    :param kwargs: As for ``ActorCriticPolicy``
     """
 
 

@@ -1,8 +1,9 @@
 """
 The algorithms in the RL Zoo: ``reinforce``, ``reinforce_lstm`` and ``finite_difference``.
 
-Importing this package registers them, with their settings and their Optuna samplers; a script around ``rl_zoo3`` needs
-nothing else. From a shell: ``python -m sb3_reinforce.zoo train --algo reinforce --env CartPole-v1``.
+Importing this package registers them with their Optuna samplers, and ``rl_zoo3.train`` finds their settings. A script
+that builds experiments uses ``Experiment`` instead of the Zoo's ``ExperimentManager``. From a shell:
+``python -m sb3_reinforce.zoo train --algo reinforce --env CartPole-v1``.
 """
 
 try:
