@@ -422,9 +422,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         One policy step along ĝ, then the critic's passes.
 
         :raises ValueError: If a gradient is not finite, or a step makes a parameter that is not; the parameters are
-            those before that step, or before the critic's passes
+            those before that step, or before the critic's passes; or if there is no rollout
         """
-        rollout = cast(Rollout, self.rollout)
+        rollout = self.rollout
+        if rollout is None:
+            raise ValueError("train needs a rollout: call learn, which collects them")
         ent_coef = self._scheduled("ent_coef")
         critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)

@@ -1,6 +1,8 @@
 """Checks of what environments return. Each error names the environment; ``learn`` adds ``num_timesteps``."""
 
 from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -44,7 +46,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 def as_reward(reward: Any, env: int) -> float:
     """Convert the reward of an environment, which must be one number, to a float."""
     values = np.asarray(reward)
-    if values.size != 1 or values.dtype.kind not in "biuf":
+    if values.size != 1 or not (values.dtype.kind in "biuf" or isinstance(values.item(), Decimal | Fraction)):
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
     return float(values.item())
 

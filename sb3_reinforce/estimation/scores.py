@@ -72,8 +72,10 @@ def gradients_by_episode(
         sums = sums_by_backward_passes(rollout, parameters, w, episode)
     else:
         sums = sums_by_factors(rollout, parameters, layers, w, episode, chunk)
-    for number, gradients in sums:
-        result[:, number] += gradients[:, columns]
+    # A compiled network cannot be differentiated for several weights
+    with th.compiler.set_stance("force_eager"):
+        for number, gradients in sums:
+            result[:, number] += gradients[:, columns]
     leave_no_graph(rollout.policy, *first_step(rollout))
     return result
 

@@ -91,10 +91,10 @@ def fit_critic(
     A gradient that is not finite raises a ValueError, and the critic keeps the parameters of the step before. A
     parameter that is not finite afterwards raises one too, and the critic keeps the parameters before all passes.
     """
-    if not parameters:
-        return 0.0
     losses = []
     value = value_of_batch(policy, route, parameters, obs, actions)
+    if not parameters:
+        return F.mse_loss(value(slice(None)).flatten().to(returns), returns).item()
     with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
             for batch in minibatches(policy, obs, len(returns), batch_size):

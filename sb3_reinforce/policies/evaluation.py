@@ -4,6 +4,7 @@ temperature. A method that a user has overridden is called as it is; ``Route`` s
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
@@ -183,21 +184,23 @@ def trainable(policy: ActorCriticPolicy) -> Parameters:
 
 def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that log π depends on, in the policy's order."""
-    return reached_by(log_prob_of(policy, obs, actions), trainable(policy))
+    return reached_by(lambda: log_prob_of(policy, obs, actions), trainable(policy))
 
 
 def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that V depends on, in the policy's order."""
     route = route_of(policy, with_critic=True)
-    values = evaluate(policy, route, obs, actions, with_values=True)[2]
-    return reached_by(cast(th.Tensor, values), trainable(policy))
+    return reached_by(lambda: cast(th.Tensor, evaluate(policy, route, obs, actions, True)[2]), trainable(policy))
 
 
-def reached_by(output: th.Tensor, parameters: Parameters) -> Parameters:
+def reached_by(compute: Callable[[], th.Tensor], parameters: Parameters) -> Parameters:
     """The parameters that an output depends on."""
-    if not output.requires_grad:
-        return []
-    gradients = th.autograd.grad(output.sum(), parameters, allow_unused=True)
+    # A compiled network has gradients of 0 where there should be none
+    with th.compiler.set_stance("force_eager"):
+        output = compute()
+        if not output.requires_grad:
+            return []
+        gradients = th.autograd.grad(output.sum(), parameters, allow_unused=True)
     return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 
 

@@ -11,8 +11,9 @@ class ParameterGroups:
     """
     What log π depends on, what only V depends on, and what both do (a shared features extractor).
 
-    They are read from graphs, not from names. A network may use a part of itself in each rollout, so the graphs of
-    further rollouts are read until each trainable parameter has been reached.
+    They are read from graphs, not from names: what stacks the outputs of actor and critic is shared. A network may use
+    a part of itself in each rollout, so the graphs of further rollouts are read until each trainable parameter has been
+    reached.
     """
 
     def __init__(self) -> None:
@@ -28,8 +29,11 @@ class ParameterGroups:
         present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
         if self.sorted_for != present:
             self.sorted_for, self.of_actor, self.of_critic = present, set(), set()
-        if not self.of_actor | self.of_critic >= set(parameters):
-            policy.set_training_mode(False)
+        for is_training in (False, True):
+            if self.of_actor | self.of_critic >= set(parameters):
+                break
+            # The scale of a layer's noise may be a parameter that acts in training mode only
+            policy.set_training_mode(is_training)
             self.of_actor.update(actor_parameters(policy, obs, actions))
             self.of_critic.update(critic_parameters(policy, obs, actions))
             if policy.share_features_extractor:

@@ -8,13 +8,14 @@ Peters and Schaal, 2008, section 4).
 import copy
 import math
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from sb3_reinforce.common.optimization import finite_norm
 from sb3_reinforce.common.tensors import to_vector
@@ -32,8 +33,14 @@ MAX_REDUCTIONS = 20
 PRECISION = 1e-10
 
 
-# cuDNN cannot differentiate the passes of a recurrent policy twice
-@th.backends.cudnn.flags(enabled=False)
+@contextmanager
+def twice_differentiable() -> Iterator[None]:
+    """Without cuDNN, fused attention and compiled networks, which PyTorch cannot differentiate twice."""
+    with th.backends.cudnn.flags(enabled=False), sdpa_kernel(SDPBackend.MATH), th.compiler.set_stance("force_eager"):
+        yield
+
+
+@twice_differentiable()
 def natural_step(
     policy: ActorCriticPolicy,
     obs: Any,

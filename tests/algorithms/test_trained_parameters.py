@@ -68,6 +68,47 @@ def test_the_critics_passes_leave_a_shared_extractor_alone_whatever_part_the_act
     assert moved and all("value_net" in name for name in moved)
 
 
+class Noisy(th.nn.Linear):
+    """A layer whose noise has a scale that is learned, and acts in training mode only (Fortunato et al., 2018)."""
+
+    def __init__(self, n_in, n_out):
+        super().__init__(n_in, n_out)
+        self.scale = th.nn.Parameter(th.full((n_out,), 0.1))
+
+    def forward(self, x):
+        y = super().forward(x)
+        return y + self.scale * th.randn_like(y) if self.training else y
+
+
+class NoisyHeads(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.action_net = Noisy(4, 2)
+        self.value_net = Noisy(4, 1)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_noise_that_acts_in_training_mode_only_is_trained(share):
+    """As in A2C."""
+    kwargs = {"net_arch": [4], "share_features_extractor": share}
+    model = make("steps", policy=NoisyHeads, policy_kwargs=kwargs)
+    assert {"action_net.scale", "value_net.scale"} <= moved_by_learning(model, 64)
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")
+@pytest.mark.parametrize("kwargs", [{}, {"step": "natural"}, {"baseline": "optimal", "n_steps": None}], ids=str)
+@pytest.mark.parametrize("part", ["mlp_extractor", "action_net", "evaluate_actions"])
+def test_a_compiled_part_is_trained_like_the_part_itself(part, kwargs):
+    ends = []
+    for is_compiled in (False, True):
+        model = make("steps", seed=0, **{"n_steps": 32, **kwargs})
+        if is_compiled:
+            setattr(model.policy, part, th.compile(getattr(model.policy, part), backend="aot_eager"))
+        ends.append([*model.learn(256).policy.parameters()])
+    th.testing.assert_close(*ends)
+
+
 def test_a_batch_may_use_no_trained_parameter():
     """Those of the other expert are all that is trained."""
     kwargs = {"net_arch": [], "features_extractor_class": Experts, "share_features_extractor": False}
@@ -94,6 +135,15 @@ def test_a_critic_warms_up_while_the_actor_is_frozen():
     moved = moved_by_learning(model, 16)
     assert "value_net.weight" in moved and all("value_net" in name for name in moved)
     assert model.logger.name_to_value["train/grad_norm"] == model.logger.name_to_value["train/kl"] == 0
+
+
+def test_a_frozen_critic_has_the_loss_of_its_values():
+    model = make("steps")
+    model.policy.requires_grad_(False)
+    model.policy.action_net.requires_grad_(True)
+    model.learn(16)
+    errors = model.rollout.returns - model.rollout.values
+    assert model.logger.name_to_value["train/value_loss"] == pytest.approx(float((errors**2).mean()), rel=1e-5)
 
 
 class Exponential(th.nn.Module):

@@ -153,6 +153,11 @@ def test_what_is_no_environment(env, kind):
         make(kind, env)
 
 
+def test_an_environment_of_the_older_library_is_converted_by_stable_baselines3():
+    with pytest.raises(TypeError, match=r"wrap it in DummyVecEnv\(\[lambda: env\]\), which converts"):
+        make("steps", type("CartPole", (), {"__module__": "gym.envs.classic_control.cartpole"})())
+
+
 @both
 def test_a_policy_goes_with_its_observations(kind):
     with pytest.raises(ValueError, match=r"policy must be MlpPolicy or CnnPolicy.*got MultiInputPolicy"):

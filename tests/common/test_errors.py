@@ -52,6 +52,11 @@ def test_numbers_may_underflow_where_numpy_raises_errors(kwargs, reward):
         check_gradient(model)
 
 
+def test_train_needs_a_rollout():
+    with pytest.raises(ValueError, match="train needs a rollout: call learn"):
+        make("steps").train()
+
+
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
     from sb3_reinforce.policies.evaluation import floor_std, set_temperature
 

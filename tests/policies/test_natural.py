@@ -199,6 +199,28 @@ def test_every_kind_of_policy_takes_it(name):
     assert not th.equal(to_vector(model.policy.parameters()), before)
 
 
+class Attention(FlattenExtractor):
+    """Attention between the features of an observation's numbers."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self._features_dim *= 16
+        self.embed = th.nn.Linear(1, 16)
+        self.attention = th.nn.MultiheadAttention(16, 2, batch_first=True)
+
+    def forward(self, observations):
+        parts = self.embed(super().forward(observations)[..., None])
+        return self.attention(parts, parts, parts, need_weights=False)[0].flatten(1)
+
+
+def test_attention_takes_it():
+    """PyTorch's fused kernel has no second derivative."""
+    kwargs = {"features_extractor_class": Attention}
+    model = REINFORCE("MlpPolicy", sums(BOX), step="natural", n_steps=64, seed=0, policy_kwargs=kwargs)
+    found = divergences_of(model, 128)
+    assert (found > 0).all() and (found <= 1.2 * 0.01).all()
+
+
 @pytest.mark.parametrize("baseline", BASELINES)
 @pytest.mark.parametrize("reward_to_go", [True, False])
 @pytest.mark.parametrize("rollout", [{"n_steps": 20}, {"n_episodes": 12}], ids=str)
