@@ -36,6 +36,7 @@ from sb3_reinforce.policies.evaluation import (
     Parameters,
     Route,
     acting_log_prob,
+    actor_parameters,
     evaluate,
     floor_std,
     route_of,
@@ -67,8 +68,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"``,
     ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no
     normalization or clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and
-    Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout and batch normalization,
-    with which the policy that is trained is not the one that acts, as in A2C.
+    Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout, batch normalization and
+    noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -275,6 +276,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
         """What the actor trains, the critic alone and both; without a critic everything is the actor's."""
         if rollout.values is None:
+            if self.step == "natural":
+                # A compiled network has gradients of 0 where there should be none
+                return actor_parameters(self.policy, batch.observations, batch.actions), [], []
             return trainable(self.policy), [], []
         held = {parameter for group in self.critic_optimizer.param_groups for parameter in group["params"]}
         if not held.issuperset(self.policy.parameters()):
@@ -500,18 +504,20 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.policy.share_features_extractor:
             self.policy.features_extractor.eval()
         update_learning_rate(self.critic_optimizer, rate)
-        value_loss = fit_critic(
-            self.policy,
-            route,
-            self.critic_optimizer,
-            critic,
-            batch.observations,
-            batch.actions,
-            batch.returns,
-            self.n_critic_updates,
-            self.batch_size,
-            self.max_grad_norm,
-        )
+        value_loss = float(F.mse_loss(values, batch.returns.to(values)))
+        if critic:
+            value_loss = fit_critic(
+                self.policy,
+                route,
+                self.critic_optimizer,
+                critic,
+                batch.observations,
+                batch.actions,
+                batch.returns,
+                self.n_critic_updates,
+                self.batch_size,
+                self.max_grad_norm,
+            )
         self.logger.record("train/value_loss", value_loss)
         self.logger.record("train/explained_variance", explained_variance(values.numpy(), batch.returns.cpu().numpy()))
 

@@ -161,7 +161,7 @@ class BasePolicyGradient(Distributed):
         :param restore_random_state: Restore the global generators of Python, NumPy and PyTorch (on the CPU and the
             model's device) as they were saved. Training then continues as if it had not been interrupted, from a reset
             of the environments on; the file has neither the environments' state and generators nor the statistics of
-            VecNormalize. If False, a model with a seed seeds them: seed them otherwise after loading
+            VecNormalize. If False, a model with a seed seeds them: call ``set_random_seed`` for others
         :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones. An
             ``lr_schedule`` that was set by hand is not stored
         :return: The model

@@ -20,7 +20,7 @@ def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
     vectorized = isinstance(env, gym.vector.VectorEnv)
     if vectorized or not isinstance(env, (str, gym.Env, VecEnv)):
         hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if vectorized else ""
-        if type(env).__module__.split(".")[0] == "gym":
+        if any(each.__module__.split(".")[0] == "gym" for each in type(env).__mro__):
             hint = ": wrap it in DummyVecEnv([lambda: env]), which converts environments of OpenAI Gym"
         raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")
     made: GymEnv = maybe_make_env(env, verbose)

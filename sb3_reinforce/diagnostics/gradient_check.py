@@ -86,8 +86,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     - ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
-    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE and hidden layers ``scores`` fails:
-    Stable-Baselines3 detaches the features on which the standard deviation depends, unless
+    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before
+    the last are trained: Stable-Baselines3 detaches the features on which the standard deviation depends, unless
     ``policy.action_dist.learn_features`` is set.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode

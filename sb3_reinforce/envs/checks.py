@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from decimal import Decimal
-from fractions import Fraction
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 def as_reward(reward: Any, env: int) -> float:
     """Convert the reward of an environment, which must be one number, to a float."""
     values = np.asarray(reward)
-    if values.size != 1 or not (values.dtype.kind in "biuf" or isinstance(values.item(), Decimal | Fraction)):
+    if values.size != 1 or not isinstance(values.item(), Decimal | Real):
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
     return float(values.item())
 

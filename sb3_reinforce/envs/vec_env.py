@@ -24,7 +24,7 @@ from sb3_reinforce.envs.checks import BadData, check_observation
 
 class GymnasiumVecEnv(VecEnv):
     """
-    A vector environment of Gymnasium for any algorithm of Stable-Baselines3.
+    A vector environment of Gymnasium for the algorithms of Stable-Baselines3.
 
     Each copy is reset within the step that ends its episode; its infos then have ``terminal_observation`` and
     ``TimeLimit.truncated``, as with ``DummyVecEnv``. Observations and rewards are checked for their form at each step.

@@ -100,7 +100,8 @@ MIN_DEFAULT_DELTA_STD = 0.05
 
 def default_n_delta(n_parameters: int, estimator: object, perturbation: object) -> int:
     """
-    ``min(2n, 64)`` perturbations up to n = 42 and ``min(n / 2, 64)`` beyond; ``min(n, 64)`` along coordinates.
+    ``min(2n, 64)`` perturbations up to n = 42 and ``min(n / 2, 64)`` beyond; differences along coordinates have
+    ``min(n, 64)``.
 
     As many random directions as parameters are nearly dependent. Noise of variance 1 in the differences gives Gaussian
     directions a ‖ĝ‖² of ``min(k, n) / (|n − k| − 1)`` on average, the mean of an inverse Wishart matrix.

@@ -11,9 +11,9 @@ class ParameterGroups:
     """
     What log π depends on, what only V depends on, and what both do (a shared features extractor).
 
-    They are read from graphs, not from names: what stacks the outputs of actor and critic is shared. A network may use
-    a part of itself in each rollout, so the graphs of further rollouts are read until each trainable parameter has been
-    reached.
+    They are read from graphs, not from names: a layer that computes π and V in one tensor counts as shared. A network
+    may use a part of itself in each rollout, so the graphs of further rollouts are read until each trainable parameter
+    has been reached. Until then it belongs to actor and critic.
     """
 
     def __init__(self) -> None:
@@ -24,21 +24,19 @@ class ParameterGroups:
     def sort(
         self, policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor
     ) -> tuple[Parameters, Parameters, Parameters]:
-        """The trainable parameters of the three groups, in the policy's order."""
+        """The trainable parameters of actor, critic alone and both, in the policy's order."""
         parameters = trainable(policy)
         present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
         if self.sorted_for != present:
             self.sorted_for, self.of_actor, self.of_critic = present, set(), set()
-        for is_training in (False, True):
-            if self.of_actor | self.of_critic >= set(parameters):
-                break
-            # The scale of a layer's noise may be a parameter that acts in training mode only
-            policy.set_training_mode(is_training)
+        if not self.of_actor | self.of_critic >= set(parameters):
+            policy.set_training_mode(False)
             self.of_actor.update(actor_parameters(policy, obs, actions))
             self.of_critic.update(critic_parameters(policy, obs, actions))
             if policy.share_features_extractor:
                 self.of_actor.update(policy.features_extractor.parameters())
-        only_critic = self.of_critic - self.of_actor
-        both = self.of_critic & self.of_actor
-        actor, critic, shared = ([p for p in parameters if p in group] for group in (self.of_actor, only_critic, both))
+        # The scale of a layer's noise may act in training mode only; a step without a gradient leaves it alone
+        others = set(parameters) - self.of_actor - self.of_critic
+        groups = self.of_actor | others, self.of_critic - self.of_actor | others, self.of_critic & self.of_actor
+        actor, critic, shared = ([p for p in parameters if p in group] for group in groups)
         return actor, critic, shared

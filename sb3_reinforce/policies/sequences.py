@@ -54,8 +54,9 @@ class RecurrentPolicy(ActorCriticPolicy):
                 make = MEMORIES[memory]
                 setattr(self, name, make(self.features_dim, n_hidden, num_layers=n_layers, **(lstm_kwargs or {})))
         if self.ortho_init:
-            for part in filter(None, (self.lstm_actor, self.lstm_critic, self.critic)):
-                initialize(part, n_hidden)
+            for part in (self.lstm_actor, self.lstm_critic, self.critic):
+                if part is not None:
+                    initialize(part, n_hidden)
         rate = self.optimizer.param_groups[0]["lr"]
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -78,8 +79,9 @@ class RecurrentPolicy(ActorCriticPolicy):
     def set_training_mode(self, mode: bool) -> None:
         """Set the mode of all parts but of memories without dropout: cuDNN has no backward pass in evaluation mode."""
         super().set_training_mode(mode)
-        for memory in filter(None, (self.lstm_actor, self.lstm_critic)):
-            memory.train(mode or not memory.dropout)
+        for memory in (self.lstm_actor, self.lstm_critic):
+            if memory is not None:
+                memory.train(mode or not memory.dropout)
 
     def predict(
         self,

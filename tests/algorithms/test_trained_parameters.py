@@ -5,11 +5,12 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
-from models import Experts, Normalized, all_kinds, make, moved_by_learning, plain
+from models import Experts, Normalized, Scaled, all_kinds, make, moved_by_learning, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 
 @all_kinds
@@ -91,21 +92,45 @@ class NoisyHeads(ActorCriticPolicy):
 @pytest.mark.parametrize("share", [True, False])
 def test_noise_that_acts_in_training_mode_only_is_trained(share):
     """As in A2C."""
-    kwargs = {"net_arch": [4], "share_features_extractor": share}
+    kwargs = {"net_arch": [4], "features_extractor_class": Scaled, "share_features_extractor": share}
     model = make("steps", policy=NoisyHeads, policy_kwargs=kwargs)
     assert {"action_net.scale", "value_net.scale"} <= moved_by_learning(model, 64)
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")
-@pytest.mark.parametrize("kwargs", [{}, {"step": "natural"}, {"baseline": "optimal", "n_steps": None}], ids=str)
-@pytest.mark.parametrize("part", ["mlp_extractor", "action_net", "evaluate_actions"])
+@pytest.mark.parametrize(
+    ("part", "kwargs"),
+    [
+        ("mlp_extractor", {}),
+        ("mlp_extractor", {"step": "natural"}),
+        ("mlp_extractor", {"step": "natural", "baseline": "leave_one_out", "n_steps": None}),
+        ("action_net", {"step": "natural"}),
+        ("evaluate_actions", {}),
+        ("evaluate_actions", {"step": "natural"}),
+        ("evaluate_actions", {"baseline": "optimal", "n_steps": None}),
+    ],
+    ids=str,
+)
 def test_a_compiled_part_is_trained_like_the_part_itself(part, kwargs):
+    # PyTorch stops compiling after a number of versions in one process
+    th.compiler.reset()
     ends = []
     for is_compiled in (False, True):
         model = make("steps", seed=0, **{"n_steps": 32, **kwargs})
         if is_compiled:
             setattr(model.policy, part, th.compile(getattr(model.policy, part), backend="aot_eager"))
         ends.append([*model.learn(256).policy.parameters()])
+    th.testing.assert_close(*ends)
+
+
+def test_a_compiled_memory_is_trained_like_the_memory_itself():
+    th.compiler.reset()
+    ends = []
+    for is_compiled in (False, True):
+        model = RecurrentREINFORCE("MlpLstmPolicy", "CartPole-v1", n_steps=32, seed=0, policy_kwargs={"net_arch": [4]})
+        if is_compiled:
+            model.policy.lstm_actor = th.compile(model.policy.lstm_actor, backend="aot_eager")
+        ends.append([*model.learn(64).policy.parameters()])
     th.testing.assert_close(*ends)
 
 
@@ -138,12 +163,14 @@ def test_a_critic_warms_up_while_the_actor_is_frozen():
 
 
 def test_a_frozen_critic_has_the_loss_of_its_values():
-    model = make("steps")
+    kwargs = {"net_arch": [4], "features_extractor_class": Normalized, "share_features_extractor": False}
+    model = make("steps", policy_kwargs=kwargs)
     model.policy.requires_grad_(False)
     model.policy.action_net.requires_grad_(True)
     model.learn(16)
     errors = model.rollout.returns - model.rollout.values
     assert model.logger.name_to_value["train/value_loss"] == pytest.approx(float((errors**2).mean()), rel=1e-5)
+    assert model.policy.vf_features_extractor.norm.num_batches_tracked == 0
 
 
 class Exponential(th.nn.Module):
