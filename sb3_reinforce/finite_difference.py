@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import choose
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -74,7 +75,8 @@ class FiniteDifference(BasePolicyGradient):
     :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
         ``torch.Generator`` that returns a tensor of shape ``(k, n)``
     :param n_delta: k, the perturbations per update. None: ``min(2n, 64)`` up to n = 42 and ``min(n / 2, 64)``
-        beyond, at least ``n_top``; differences along coordinates have ``min(n, 64)``
+        beyond, at least ``n_top``; differences along coordinates have ``min(n, 64)``. It is chosen at construction:
+        set ``model.n_delta = None`` after layers are frozen
     :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
     :param n_eval_episodes: Episodes per candidate, whose utility is their mean return
@@ -184,7 +186,8 @@ class FiniteDifference(BasePolicyGradient):
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
-            self.n_delta = max(default_n_delta(n_parameters, self.estimator, self.perturbation), self.n_top or 0)
+            n_delta = default_n_delta(n_parameters, self.estimator, self.perturbation)
+            choose(self, "n_delta", max(n_delta, self.n_top or 0))
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators, the environments and the perturbations; None changes nothing."""

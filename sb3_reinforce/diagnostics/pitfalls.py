@@ -110,7 +110,7 @@ def unscaled_returns(history: History) -> str | None:
 
 def too_few_episodes(history: History) -> str | None:
     """
-    A signal-to-noise ratio of the gradients of 50 updates below 0.1, with fewer than 8 episodes or 64 steps an update.
+    A signal-to-noise ratio of the gradients of 50 updates below 0.1, with fewer than 8 whole episodes or 64 steps each.
 
     The ratio alone would not do: it is near 0 for a policy that has nothing left to learn, however large its batches.
     """
@@ -119,7 +119,8 @@ def too_few_episodes(history: History) -> str | None:
     # Parameters may be frozen or unfrozen on the way, and then gradients are not comparable
     gradients = [update.gradient for update in history.updates]
     is_comparable = len(gradients[-1]) > 0 and all(each.shape == gradients[-1].shape for each in gradients)
-    if len(gradients) < 50 or not is_comparable or (n_episodes >= 8 and n_steps >= 64):
+    is_large = n_episodes >= 8 if history.model.n_steps is None else n_steps >= 64
+    if len(gradients) < 50 or not is_comparable or is_large:
         return None
     matrix = gram(th.stack(gradients))
     ratio = float(signal_to_noise(compute_moments(matrix, th.ones(1, len(matrix), dtype=th.float64))))

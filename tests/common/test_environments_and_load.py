@@ -187,5 +187,11 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
     make("steps", n_steps=32).save(tmp_path / "model")
     with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both given"):
         loaded(1, n_episodes=4)
-    make("search", n_delta=None).save(tmp_path / "model")
+    search = make("search", n_delta=None)
+    search.save(tmp_path / "model")
     assert FiniteDifference.load(tmp_path / "model", device="cpu", n_top=2).n_top == 2
+    assert search.n_delta == 60
+    assert FiniteDifference.load(tmp_path / "model", device="cpu", perturbation="coordinate").n_delta == 30
+    search.policy.action_net.requires_grad_(False)
+    search.n_delta = None
+    assert search.learn(1).n_delta == 40

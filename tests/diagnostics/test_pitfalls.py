@@ -98,6 +98,7 @@ def history(updates, progress, signal, n_updates, kwargs):
 
 
 few = {"n_episodes": 4}
+episodes = {"n_episodes": 16, "baseline": "mean"}
 large = {"return_scale": 1001.0}
 spread = {"randomness": 1.0}
 peaked = {"randomness": 0.3}
@@ -122,10 +123,10 @@ free = {"max_grad_norm": None}
         ("unscaled_returns", seen(large), seen({"return_scale": 999.0})),
         ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
         ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
-        ("too_few_episodes", seen(few, n=50), seen(few, n=50, signal=0.3)),
-        ("too_few_episodes", seen({"n_episodes": 7}, n=50), seen({"n_episodes": 8}, n=50)),
-        ("too_few_episodes", seen({"n_steps": 63}, n=50), seen({"n_steps": 64}, n=50)),
-        ("too_few_episodes", seen(few, n=50), seen(few, n=49)),
+        ("too_few_episodes", seen(few, n=50, **episodes), seen(few, n=50, signal=0.3, **episodes)),
+        ("too_few_episodes", seen({"n_episodes": 7}, n=50, **episodes), seen({"n_episodes": 8}, n=50, **episodes)),
+        ("too_few_episodes", seen({"n_steps": 63}, n=50), seen({"n_steps": 64, "n_episodes": 4}, n=50)),
+        ("too_few_episodes", seen(few, n=50, **episodes), seen(few, n=49, **episodes)),
         ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 19, {"grad_norm": 9.9}, **free)),
         ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 18, spike, **free)),
         ("spikes_without_clipping", seen(*[{}] * 19, spike, **free), seen(*[{}] * 19, spike)),
@@ -169,7 +170,7 @@ def test_of_several_pitfalls_with_one_cause_the_cause_is_reported():
 
 
 def test_a_negative_signal_to_noise_ratio_is_not_a_number_for_a_reader():
-    found = history(*seen(few, n=50))
+    found = history(*seen(few, n=50, **episodes))
     for index, update in enumerate(found.updates):
         update.gradient.fill_((-1) ** index)
     sentence = PITFALLS["too_few_episodes"](found)
@@ -243,7 +244,7 @@ def healthy(env, timesteps, n_envs=8, normalize=False, **kwargs):
     ("cartpole", "pendulum"), [(15_000, 15_000), pytest.param(60_000, 100_000, marks=pytest.mark.slow)]
 )
 def test_nothing_is_said_of_a_healthy_run(cartpole, pendulum):
-    assert healthy("CartPole-v1", cartpole) == ({}, 0)
+    assert healthy("CartPole-v1", cartpole) == healthy("CartPole-v1", cartpole, n_envs=4) == ({}, 0)
     assert healthy("Pendulum-v1", pendulum, normalize=True, gamma=0.9) == ({}, 0)
 
 
