@@ -110,7 +110,8 @@ def unscaled_returns(history: History) -> str | None:
 
 def too_few_episodes(history: History) -> str | None:
     """
-    A signal-to-noise ratio of the gradients of 50 updates below 0.1, with fewer than 8 whole episodes or 64 steps each.
+    A signal-to-noise ratio of the gradients of 50 updates below 0.1. Each has fewer than 8 whole episodes or, in fixed
+    rollouts, 64 steps.
 
     The ratio alone would not do: it is near 0 for a policy that has nothing left to learn, however large its batches.
     """

@@ -13,13 +13,16 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.arguments import check_flag, check_integer, check_kind
+from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import by_step, compute_weights
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 
 
-def sample(model: REINFORCE, n_episodes: int, baseline: str | None = None, progress_bar: bool = False) -> Rollout:
+def sample(
+    model: REINFORCE, n_episodes: int, baseline: str | Baseline | None = None, progress_bar: bool = False
+) -> Rollout:
     """
     Whole episodes of the model's policy in its environments, with the model's own returns.
 
