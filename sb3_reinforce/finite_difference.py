@@ -13,11 +13,16 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import choose
+from sb3_reinforce.common.arguments import check_function, choose
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn
+from sb3_reinforce.common.settings import (
+    FINITE_DIFFERENCE_ARGUMENTS,
+    check_finite_difference,
+    check_learn,
+    check_named,
+)
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
@@ -62,9 +67,9 @@ class FiniteDifference(BasePolicyGradient):
     other policies one after the other.
 
     With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and the
-    observations seen join them afterwards; the first update has the scale of the first observations. Utilities are sums
-    of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of that
-    wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
+    observations of its steps join them afterwards; the first update has the scale of the first observations. Utilities
+    are sums of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of
+    that wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -106,7 +111,10 @@ class FiniteDifference(BasePolicyGradient):
         "MaskedPolicy": MaskedPolicy,
     }
     policy: ActorCriticPolicy
-    _arguments = FINITE_DIFFERENCE_ARGUMENTS
+    _arguments = FINITE_DIFFERENCE_ARGUMENTS | {
+        "estimator": partial(check_named, functions=ESTIMATORS),
+        "perturbation": partial(check_named, functions=PERTURBATIONS),
+    }
     _own_argument = "standardize_utilities"
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
@@ -168,7 +176,7 @@ class FiniteDifference(BasePolicyGradient):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
+        check_finite_difference(self)
         self._setup_lr_schedule()
         super().set_random_seed(self.seed)
         policy_class = cast(type[ActorCriticPolicy], self.policy_class)
@@ -182,7 +190,7 @@ class FiniteDifference(BasePolicyGradient):
 
     def _check_arguments(self) -> None:
         """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
-        check_finite_difference(self, ESTIMATORS, PERTURBATIONS)
+        check_finite_difference(self)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
@@ -190,7 +198,7 @@ class FiniteDifference(BasePolicyGradient):
             choose(self, "n_delta", max(n_delta, self.n_top or 0))
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed the global generators, the environments and the perturbations; None changes nothing."""
+        """Seed the global generators and the environments, and with a seed the perturbations too."""
         super().set_random_seed(seed)
         if seed is not None:
             self._generator = new_generator()
@@ -292,9 +300,9 @@ class FiniteDifference(BasePolicyGradient):
             n_delta = cast(int, self.n_delta)
             generator = cast(th.Generator, self._generator)
             delta_std = default_delta_std(theta) if self.delta_std is None else self._scheduled("delta_std")
-            perturbation = self._function("perturbation", PERTURBATIONS)
+            perturbation = check_function("perturbation", self.perturbation, PERTURBATIONS)
             deltas = sample_deltas(perturbation, n_delta, n, delta_std, generator)
-            estimator = self._function("estimator", ESTIMATORS)
+            estimator = check_function("estimator", self.estimator, ESTIMATORS)
             if self.n_top is not None:
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))

@@ -1,6 +1,7 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -16,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
+from sb3_reinforce.common.arguments import check_function
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -23,6 +25,7 @@ from sb3_reinforce.common.settings import (
     INSTEAD_OF_PPO,
     REINFORCE_ARGUMENTS,
     check_learn,
+    check_named,
     check_reinforce,
     check_starts,
 )
@@ -125,7 +128,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         samples and where the deviation is 0
     :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
         (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of
-        a thousand steps or more. Policies with dropout or batch normalization are refused
+        a thousand steps or more. Policies whose log π differs in training mode, as with dropout, are refused
     :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout (at
         most 1.2 times it), before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
@@ -145,7 +148,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     }
     #: Whether a rollout is by default whole episodes, also with a critic
     prefers_episodes: ClassVar[bool] = False
-    _arguments = REINFORCE_ARGUMENTS
+    _arguments = REINFORCE_ARGUMENTS | {"baseline": partial(check_named, functions=BASELINES)}
     _own_argument = "reward_to_go"
     _instead = INSTEAD_OF_PPO
 
@@ -238,7 +241,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     @property
     def has_critic(self) -> bool:
         """Whether a critic is trained and used."""
-        return self._function("baseline", BASELINES) is BASELINES["value"]
+        return check_function("baseline", self.baseline, BASELINES) is BASELINES["value"]
 
     @property
     def shares_starts(self) -> bool:
@@ -252,7 +255,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return self._scheduled("critic_learning_rate")
 
     def _setup_model(self) -> None:
-        check_reinforce(self, BASELINES)
+        check_reinforce(self)
         # Stable-Baselines3 sizes the buffer here; for whole episodes each rollout resizes it
         n_steps = self.n_steps
         self.n_steps = n_steps or 1
@@ -318,7 +321,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.env is not env_before:
             env = cast(VecEnv, self.env)
         # The user or a callback may have changed arguments
-        check_reinforce(self, BASELINES)
+        check_reinforce(self)
         check_starts(self)
         self._apply_temperature_and_floor()
         if self.use_sde:
@@ -333,7 +336,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             extent = Extent.whole_episodes(n_episodes, env.num_envs, self.max_episode_steps)
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
-        baseline = self._function("baseline", BASELINES)
+        baseline = check_function("baseline", self.baseline, BASELINES)
         route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
         is_whole = False
@@ -566,8 +569,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["_groups", "rollout", "is_collecting"]
-        return [*super()._excluded_save_params(), *own]
+        return [*super()._excluded_save_params(), "_groups", "rollout", "is_collecting"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

@@ -193,6 +193,14 @@ class Wrapper(VecEnvWrapper):
         return self.venv.step_wait()
 
 
+class NumericEnds(Wrapper):
+    """Says in numbers which episodes end, as some VecEnvs do."""
+
+    def step_wait(self):
+        obs, rewards, dones, infos = super().step_wait()
+        return obs, rewards, dones.astype(np.float32), infos
+
+
 class Reused(Wrapper):
     """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
 

@@ -42,15 +42,13 @@ def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> V
     return ValueError(f"{name} must be {allowed} {', '.join(map(repr, known.values()))}, got {value!r}{hint}")
 
 
-def check_number(name: str, value: Any, low: float = -MAX, high: float = MAX, above: bool = False) -> float:
+def check_number(name: str, value: Any, low: float, high: float = MAX, above: bool = False) -> float:
     """Return a number in the range as a float; with ``above``, ``low`` itself is excluded."""
     number = float(check_kind(name, value, (Real,), "a number"))
     if not low <= number <= high or (above and number == low):
-        allowed = "finite"
+        allowed = f"{'finite and ' if high == MAX else ''}{'>' if above else '>='} {low:g}"
         if high < MAX:
             allowed = f"in {'(' if above else '['}{low:g}, {high:g}]"
-        elif low > -MAX:
-            allowed = f"{'finite and ' if high == MAX else ''}{'>' if above else '>='} {low:g}"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 

@@ -1,6 +1,6 @@
 """What both algorithms inherit: checked arguments, prediction, saving, loading and going on."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from io import BytesIO
 from typing import Any, ClassVar, TypeVar
@@ -16,7 +16,6 @@ from sb3_reinforce.common.arguments import (
     CheckedSchedule,
     check_device,
     check_flag,
-    check_function,
     own_arguments,
 )
 from sb3_reinforce.common.distribution import Distributed
@@ -70,7 +69,7 @@ class BasePolicyGradient(Distributed):
         check_policy_name(policy, self.policy_aliases)
 
     def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = self._schedule("learning_rate")
+        self.lr_schedule = self._checked("learning_rate")
 
     def _renew_lr_schedule(self) -> None:
         """Follow another learning rate that a callback has set, unless the user has replaced the schedule itself."""
@@ -81,20 +80,19 @@ class BasePolicyGradient(Distributed):
         self._renew_lr_schedule()
         super()._update_learning_rate(optimizers)
 
-    def _schedule(self, name: str) -> CheckedSchedule:
-        """Return the checked schedule of an argument, a new one where a callback has set another value."""
-        given = getattr(self, name)
-        if name not in self._schedules or self._schedules[name].given is not given:
-            self._schedules[name] = self._arguments[name](name, given)
-        return self._schedules[name]
+    def _checked(self, name: str) -> Any:
+        """Check an argument as it is now, and return it; a schedule only once, since a user's function may be slow."""
+        given = getattr(self, ATTRIBUTES.get(name, name))
+        if name in self._schedules and self._schedules[name].given is given:
+            return self._schedules[name]
+        value = self._arguments[name](name, given)
+        if isinstance(value, CheckedSchedule):
+            self._schedules[name] = value
+        return value
 
     def _scheduled(self, name: str) -> float:
         """Return the present value of an argument that may be a schedule."""
-        return self._schedule(name)(self._current_progress_remaining)
-
-    def _function(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
-        """Return the function that an argument names, or the user's own."""
-        return check_function(name, getattr(self, name), functions)
+        return float(self._checked(name)(self._current_progress_remaining))
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # The last rollout may overshoot total_timesteps, and must not train at a negative rate
@@ -223,13 +221,13 @@ class BasePolicyGradient(Distributed):
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
         :param exact_match: Whether there must be a state for everything that has one here, and nothing else. If not,
-            some may be missing, FiniteDifference leaves out REINFORCE's ``critic_optimizer``, and the state of another
-            kind of optimizer is left out, with a warning
+            some may be missing. FiniteDifference leaves out REINFORCE's ``critic_optimizer``; parameters with other
+            names, and the state of another kind of optimizer, are left out with a warning
         :param device: Device on which the parameters are loaded
         :raises TypeError: If an argument is of the wrong type, or a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
             to other parameters
-        :raises RuntimeError: If the parameters of the policy have other names or shapes
+        :raises RuntimeError: If parameters of the policy have other shapes, or with ``exact_match`` other names
         """
         check_flag("exact_match", exact_match)
         check_device("device", device)

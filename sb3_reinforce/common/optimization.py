@@ -66,5 +66,5 @@ def fuse(optimizer: th.optim.Optimizer) -> None:
     """Let Adam and AdamW take their step in one kernel, unless the user has chosen another implementation."""
     if type(optimizer) in (th.optim.Adam, th.optim.AdamW):
         for group in optimizer.param_groups:
-            has_chosen = group["fused"] is False or group["foreach"] or group["differentiable"]
-            group["fused"] = not has_chosen
+            if group["fused"] is None and group["foreach"] is None and not group["differentiable"]:
+                group["fused"] = True

@@ -31,8 +31,6 @@ from sb3_reinforce.common.arguments import (
 from sb3_reinforce.common.processes import rank_and_size
 from sb3_reinforce.common.spaces import check_noise
 
-Functions = Mapping[str, Callable[..., Any]]
-
 # A larger step can take a parameter out of the range of float32
 MAX_LEARNING_RATE = 1e6
 # What NumPy takes
@@ -147,29 +145,21 @@ LEARN_ARGUMENTS: dict[str, Check] = {
 ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size"}
 
 
-def check_attributes(model: Any, arguments: Mapping[str, Check]) -> None:
-    """Check the arguments as the model has them now, and store each in Python's own type."""
-    for name, check in arguments.items():
-        attribute = ATTRIBUTES.get(name, name)
-        given = getattr(model, attribute)
-        if name in model._schedules and model._schedules[name].given is given:
-            # It was checked when it was made, and a function of the user may be slow
-            continue
-        value = check(name, given)
-        if isinstance(value, CheckedSchedule):
-            model._schedules[name] = value
-        else:
-            setattr(model, attribute, value)
+def check_attributes(model: Any) -> None:
+    """Check the arguments as the model has them now, and store each but schedules in Python's own type."""
+    for name in model._arguments:
+        value = model._checked(name)
+        if not isinstance(value, CheckedSchedule):
+            setattr(model, ATTRIBUTES.get(name, name), value)
     check_subclass("policy", model.policy_class, ActorCriticPolicy)
     space = model.observation_space
     if model.policy_class is MultiInputActorCriticPolicy and not isinstance(space, spaces.Dict):
         raise ValueError(f"policy must be MlpPolicy or CnnPolicy for observations in {space}, got MultiInputPolicy")
 
 
-def check_reinforce(model: Any, baselines: Functions) -> None:
+def check_reinforce(model: Any) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
-    check_attributes(model, REINFORCE_ARGUMENTS)
-    model.baseline = check_named("baseline", model.baseline, baselines)
+    check_attributes(model)
     check_noise(model.use_sde, model.action_space)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
@@ -198,7 +188,7 @@ def check_reinforce(model: Any, baselines: Functions) -> None:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
 
 
-def check_named(name: str, value: Any, functions: Functions) -> Any:
+def check_named(name: str, value: Any, functions: Mapping[str, Callable[..., Any]]) -> Any:
     """Return the user's own function, or the name of one of ours, which has the limits of its name."""
     function = check_function(name, value, functions)
     return next((each for each, known in functions.items() if known is function), function)
@@ -223,11 +213,9 @@ def check_starts(model: Any) -> None:
         )
 
 
-def check_finite_difference(model: Any, estimators: Functions, perturbations: Functions) -> None:
+def check_finite_difference(model: Any) -> None:
     """Check the arguments of a FiniteDifference."""
-    check_attributes(model, FINITE_DIFFERENCE_ARGUMENTS)
-    model.estimator = check_named("estimator", model.estimator, estimators)
-    check_function("perturbation", model.perturbation, perturbations)
+    check_attributes(model)
     if model.policy_kwargs.get("use_sde"):
         raise ValueError("policy_kwargs must not have use_sde=True: FiniteDifference perturbs parameters, not actions")
     if model.n_delta == 1 and model.estimator == "regression":

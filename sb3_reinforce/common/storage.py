@@ -129,12 +129,11 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
         return "it has other groups of parameters"
     for setting, value in own["param_groups"][0].items():
         for group in groups:
-            if setting not in group:
-                if setting in FLAGS:
-                    continue
+            if setting not in {*group, *FLAGS}:
                 return f"it has no {setting}: it belongs to another optimizer"
-            if isinstance(value, (float, tuple)) and type(group[setting]) not in (type(value), list, int):
-                return f"its {setting} is {group[setting]!r}"
+            given = group.get(setting, value)
+            if isinstance(value, (float, tuple)) and type(given) not in (type(value), list, int):
+                return f"its {setting} is {given!r}"
     parameters = dict(enumerate(parameter for group in optimizer.param_groups for parameter in group["params"]))
     for index, moments in state.get("state", {}).items():
         if index not in parameters:
@@ -153,7 +152,13 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
 def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
     """Load the state of a module or an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
     if isinstance(part, th.nn.Module):
-        part.load_state_dict(state, strict=exact_match)
+        left = part.load_state_dict(state, strict=exact_match)
+        if left.missing_keys or left.unexpected_keys:
+            warnings.warn(
+                f"load_path_or_dict[{name!r}] has other names than this {type(part).__name__}: nothing for "
+                f"{left.missing_keys}, which stay as they are, and {left.unexpected_keys}, which are left out",
+                stacklevel=3,
+            )
         return
     reason = optimizer_mismatch(part, state)
     needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"

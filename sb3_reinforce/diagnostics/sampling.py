@@ -61,7 +61,7 @@ def collect_episodes(collector: REINFORCE, bar: Any = None) -> Rollout:
     def count(local: dict[str, Any], _: dict[str, Any]) -> bool:
         if bar is not None:
             # An environment that has played its quota goes on, and its further episodes do not count
-            bar.update(int(np.count_nonzero(local["dones"] & (local["extent"].remaining > 0))))
+            bar.update(int(np.count_nonzero(np.logical_and(local["dones"], local["extent"].remaining > 0))))
         return True
 
     callback = ConvertCallback(count)

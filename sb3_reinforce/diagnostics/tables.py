@@ -60,10 +60,10 @@ class Table(Generic[Row]):
     :param legend: What columns mean, printed below the table
     """
 
-    def __init__(self, title: str, rows: list[Row], legend: Mapping[str, str] | None = None):
+    def __init__(self, title: str, rows: list[Row], legend: Mapping[str, str]):
         self.title = title
         self.rows = rows
-        self.legend = {} if legend is None else legend
+        self.legend = legend
         self.columns = [field.name for field in fields(rows[0])]  # type: ignore[arg-type]
 
     @property
@@ -91,7 +91,7 @@ class Table(Generic[Row]):
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells
         ]
-        width = max(map(len, self.legend), default=0)
+        width = max(map(len, self.legend))
         return "\n".join([self.title, *lines, *(f"  {key.ljust(width)}  {text}" for key, text in self.legend.items())])
 
     def to_pandas(self) -> Any:

@@ -1,5 +1,5 @@
 """
-Guards of the environments while a model learns: a fault is named where it enters, before it does harm.
+Guards of the environments while a model learns or is measured: a fault is named where it enters, before it does harm.
 
 ``step_wait`` and ``reset`` are replaced on two instances: the innermost ``DummyVecEnv``, not a subclass of it, to check
 the form of observations; and what lies right below each ``VecNormalize``, to check that numbers are finite.

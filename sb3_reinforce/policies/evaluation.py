@@ -38,7 +38,7 @@ MIN_TEMPERATURE = 1e-3
 @dataclass(frozen=True)
 class Route:
     """
-    Which methods of a policy are called, decided once for a rollout and once for an update.
+    Which methods of a policy are called, in a rollout (until a callback changes the policy) or an update.
 
     ``actor`` and ``critic`` are the layers of plain MLPs, else None. With ``forward``, actions come from ``forward``,
     and V and log π along with them. With ``evaluate_actions``, log π and V come from that method, else from

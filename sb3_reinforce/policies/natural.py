@@ -98,7 +98,7 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
 
     def divergence() -> th.Tensor:
         kl = kl_divergence(now, action_distribution(policy, obs))
-        return kl.flatten(1).sum(1).mean() if kl.dim() > 1 else kl.mean()
+        return kl.sum() / len(kl)
 
     return divergence
 

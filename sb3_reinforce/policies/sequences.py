@@ -72,7 +72,7 @@ class RecurrentPolicy(ActorCriticPolicy):
             raise ValueError(
                 "observation_space must have features whose number is an int for a policy with a memory, got "
                 f"{self.observation_space}, for which {type(extractor).__name__} has features_dim={size!r}: give "
-                "MultiDiscrete observations as a Box"
+                "MultiDiscrete observations as a Box, or make features_dim an int"
             )
         return extractor
 

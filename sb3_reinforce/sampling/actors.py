@@ -126,7 +126,7 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
 
 
 def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_prob: bool) -> Actor:
-    """The fastest actor that acts as the policy would; only with ``with_log_prob`` it gives log π too."""
+    """The fastest actor that acts as the policy would; it may leave out log π without ``with_log_prob``."""
     if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
         return NumpyActor(policy, route.actor, n_envs, with_log_prob)
     return PolicyActor(policy, route, with_log_prob)

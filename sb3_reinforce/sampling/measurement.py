@@ -48,7 +48,7 @@ def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
     return obs
 
 
-def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any] | None = None) -> Any:
+def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any] | None) -> Any:
     """
     A copy of a REINFORCE for measurements of whole episodes: it shares policy and environments, with its own log,
     counters and rollouts. ``collect_rollouts`` resets the environments first. Without a baseline it has ``"value"``

@@ -1,4 +1,4 @@
-"""VecNormalize during a comparison: one scale for all candidates, and no observation lost."""
+"""VecNormalize during a comparison: one scale for all candidates, which learns from all steps afterwards."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -234,7 +234,6 @@ def test_the_search_recommends_the_cpu(policy):
 @pytest.mark.parametrize(
     ("check", "wrong", "allowed"),
     [
-        (arguments.check_number, INF, "finite"),
         (partial(arguments.check_number, low=0), -1, "finite and >= 0"),
         (partial(arguments.check_number, low=0, above=True), 0, "finite and > 0"),
         (partial(arguments.check_number, low=0, high=1), 2, r"in \[0, 1\]"),

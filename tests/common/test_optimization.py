@@ -4,7 +4,14 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_reinforce.common.optimization import step
+from sb3_reinforce.common.optimization import fuse, step
+
+
+@pytest.mark.parametrize("chosen", [{"foreach": False}, {"foreach": True}, {"fused": False}, {"differentiable": True}])
+def test_the_users_choice_of_an_implementation_is_kept(chosen):
+    adam = th.optim.Adam([nn.Parameter(th.zeros(1))], **chosen)
+    fuse(adam)
+    assert not adam.param_groups[0]["fused"]
 
 
 @pytest.mark.parametrize("fused", [True, False])

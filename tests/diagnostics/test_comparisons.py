@@ -6,7 +6,7 @@ import numpy as np
 import pandas
 import pytest
 import torch as th
-from environments import Corridor, Tree
+from environments import Corridor, NumericEnds, Tree
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -139,7 +139,8 @@ def test_time_or_state_halve_the_variance_on_cartpole():
 
 def test_a_progress_bar_counts_the_episodes(capsys):
     """What an environment plays beyond its share does not count; of each start there are eight."""
-    model = REINFORCE("MlpPolicy", make_vec_env(lambda: Tree(ragged=True), 3, seed=0), device="cpu")
+    env = NumericEnds(make_vec_env(lambda: Tree(ragged=True), 3, seed=0))
+    model = REINFORCE("MlpPolicy", env, device="cpu")
     for compare, n, shown in ((compare_baselines, 20, "20/20"), (compare_starts, 6, "48/48")):
         compare(model, n, progress_bar=True)
         assert f"| {shown} [" in capsys.readouterr().err

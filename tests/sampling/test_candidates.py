@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from environments import Wrapper
+from environments import NumericEnds, Wrapper
 from gymnasium import spaces
 from models import OwnPrediction, Scaled
 from policy_changes import CHANGES
@@ -243,14 +243,6 @@ class Shifted(Wrapper):
 
 class Monitored(VecMonitor):
     """A subclass with the steps of a wrapper that leaves rewards alone."""
-
-
-class NumericEnds(Wrapper):
-    """Says in numbers which episodes end, as some VecEnvs do."""
-
-    def step_wait(self):
-        obs, rewards, dones, infos = super().step_wait()
-        return obs, rewards, dones.astype(np.float32), infos
 
 
 def halved(env):
