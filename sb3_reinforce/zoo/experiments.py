@@ -64,10 +64,11 @@ class Experiment(exp_manager.ExperimentManager):
         try:
             return super().setup_experiment()
         except (AssertionError, TypeError, ValueError) as error:
-            # Stable-Baselines3 asserts that a policy supports the spaces; errors about an argument name it at these
-            # places; all other errors keep their traceback
+            # Stable-Baselines3 asserts with a sentence that it supports the spaces; errors about an argument name it at
+            # these places; all other errors keep their traceback
             named = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
-            if isinstance(error, AssertionError) or not self.argument_names.isdisjoint(map(str.lower, named)):
+            is_unsupported = isinstance(error, AssertionError) and str(error)
+            if is_unsupported or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
 

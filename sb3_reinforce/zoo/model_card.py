@@ -60,8 +60,9 @@ python -m sb3_reinforce.zoo enjoy --algo {name} --env {env} -f {folder}
 
 def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Path:
     """Evaluate the last agent that ``train`` has saved in a folder, and write ``README.md`` beside it."""
-    _, model, run = utils.get_model_path(0, folder, name, utils.EnvironmentName(env_id))
-    saved = Path(run, env_id)
+    env_name = utils.EnvironmentName(env_id)
+    _, model, run = utils.get_model_path(0, folder, name, env_name)
+    saved = Path(run, env_name)
     arguments = yaml.unsafe_load((saved / "args.yml").read_text())
     for package in arguments["gym_packages"]:
         importlib.import_module(package)

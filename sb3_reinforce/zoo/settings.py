@@ -50,11 +50,12 @@ def load_configuration(config: str) -> Any:
     try:
         if config.endswith((".yml", ".yaml")):
             return yaml.safe_load(Path(config).read_text())
-        if config.endswith(".py"):
-            return runpy.run_path(config)["hyperparams"]
+        names = runpy.run_path(config) if config.endswith(".py") else vars(importlib.import_module(config))
     except (OSError, yaml.YAMLError) as error:
         raise ConfigurationError(f"{config} cannot be read: {error}") from error
-    return importlib.import_module(config).hyperparams
+    if "hyperparams" not in names:
+        raise ConfigurationError(f"{config} must define a dict named hyperparams")
+    return names["hyperparams"]
 
 
 def allowed_keys(algorithm: str) -> set[str]:
@@ -83,7 +84,9 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     for key, value in hyperparams.items():
         if isinstance(value, str):
             if re.fullmatch(r"[-+\d.]+e[-+\d]+", value, re.IGNORECASE):
-                raise ConfigurationError(f"{key} is the text {value!r}, as YAML reads it: write !!float {value}")
+                raise ConfigurationError(
+                    f"{key} is the text {value!r}: write !!float {value} in YAML, and {value} in -params"
+                )
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
     for key, path, _ in classes_of(hyperparams):
@@ -94,6 +97,14 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     for key in ("n_envs", "frame_stack"):
         check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
+    for key, value in hyperparams.items():
+        try:
+            yaml.unsafe_load(yaml.dump(value))
+        except (yaml.YAMLError, TypeError, AttributeError) as error:
+            raise ConfigurationError(
+                f"{key} cannot be read again from the config.yml beside the model: put functions and classes into a "
+                f"module that can be imported ({error})"
+            ) from error
 
 
 def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
@@ -118,5 +129,6 @@ def as_dict(key: str, value: Any) -> Settings:
         except Exception as error:
             raise ConfigurationError(f"{key} must be Python, but {value!r} raises {error!r}") from error
     if not isinstance(result, dict):
-        raise ConfigurationError(f"{key} must be a dict, got {value!r}")
+        flag = "True, False or " if key == "normalize" else ""
+        raise ConfigurationError(f"{key} must be {flag}a dict, got {value!r}")
     return result

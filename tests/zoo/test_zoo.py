@@ -47,7 +47,7 @@ def test_train_finds_the_settings_without_a_conf_file(name, folder):
 @pytest.mark.parametrize("name", NAMES)
 def test_enjoy(name, folder, capsys):
     for which in ((), ("--load-best",), ("--load-last-checkpoint",)):
-        zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
+        zoo("enjoy", "--algo", name, "--fold", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
         assert "Mean reward: " in capsys.readouterr().out
 
 
@@ -62,6 +62,14 @@ def test_a_model_card_describes_the_last_agent(name, folder):
     assert f"enjoy --algo {name} --env CartPole-v1 -f logs\n" in text and "-n 400 -f logs --seed 1" in text
     settings = text.partition("```yaml\n")[2].partition("```")[0]
     assert yaml.safe_load(settings) == config_of(card.parent)
+
+
+def test_a_model_card_of_an_environment_in_a_namespace(tmp_path, monkeypatch):
+    spec = gym.envs.registration.EnvSpec("own/Pole-v0", lambda: gym.make("CartPole-v1"))
+    monkeypatch.setitem(gym.registry, "own/Pole-v0", spec)
+    train("reinforce", "-n", "64", "-f", str(tmp_path), "--eval-freq", "-1", env="own/Pole-v0")
+    card = write_card(str(tmp_path), "reinforce", "own/Pole-v0", n_episodes=2)
+    assert card.parent.name == "own-Pole-v0_1" and "--env own/Pole-v0" in card.read_text()
 
 
 def test_a_model_card_names_the_classes_of_the_settings(tmp_path):
@@ -219,6 +227,7 @@ SETTINGS = [
     ("env_wrapper: [{gymnasium.wrappers.RescaleAction: {low: 1}}]", "unexpected keyword argument 'low'"),
     ("env_wrapper: [{gymnasium.wrappers.FlattenObservation: }]", "in env_wrapper must be a dict, got None"),
     ("env_wrapper: ..x", "env_wrapper must be the path of a class, got '..x'"),
+    ("normalize: 1", "normalize must be True, False or a dict, got 1"),
     ("normalize: {norm_ob: true}", "unexpected keyword argument 'norm_ob'"),
     ("normalize: {norm_obs_keys: [x]}", "`norm_obs_keys` param is applicable only with"),
     ("use_sde: true", "use_sde=True is for Box action spaces"),
@@ -237,7 +246,25 @@ def test_a_wrong_configuration_is_named(conf, sentence, tmp_path, capsys):
     assert sentence in message_of(capsys, *arguments)
 
 
-@pytest.mark.parametrize("error", [ValueError("another"), TypeError("f() got an unexpected keyword argument 'x'")])
+FALLING = "hyperparams = {'CartPole-v1': {'policy': 'MlpPolicy', 'n_timesteps': 100, 'learning_rate': f}}"
+
+
+@pytest.mark.parametrize(
+    ("conf", "sentence"),
+    [
+        ("settings = {}", "must define a dict named hyperparams"),
+        (f"def f(left): return 0.1 * left\n{FALLING}", "learning_rate cannot be read again from the config.yml"),
+        (f"f = lambda left: 0.1 * left\n{FALLING}", "learning_rate cannot be read again from the config.yml"),
+    ],
+)
+def test_what_could_not_be_read_again_is_refused(conf, sentence, tmp_path, capsys):
+    (tmp_path / "wrong.py").write_text(conf)
+    assert sentence in message_of(capsys, *REINFORCE, "-conf", str(tmp_path / "wrong.py"), "-f", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("another"), AssertionError(), TypeError("f() got an unexpected keyword argument 'x'")]
+)
 def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, monkeypatch):
     monkeypatch.setattr(ExperimentManager, "create_envs", mock.Mock(side_effect=error))
     with pytest.raises(type(error)) as caught:
@@ -253,6 +280,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         (["train", "--algo", "reinforced"], "got 'reinforced': did you mean 'reinforce'?"),
         (["enjoy", "--algo", "x"], "--algo must be one of 'a2c', "),
         (["train", "--env-kwargs", "gravty:3"], "--env-kwargs: CartPoleEnv.__init__() got an unexpected keyword"),
+        (["train", "--eval-env-kwargs", "max_episode_steps:0"], "--eval-env-kwargs: Expect the `max_episode_steps`"),
         (["enjoy", "--algo", "reinforce", "-f", "logs"], "The logs/reinforce folder was not found: pass the folder"),
         (["record_video", "-f", ".", "--exp-id", "-1"], "The ./ppo folder was not found: pass the folder"),
         (["train", "--env", "CartPol-v1"], "--gym-packages PACKAGE): did you mean CartPole-v"),
