@@ -16,8 +16,8 @@
 # $\nabla p_\theta = p_\theta \nabla \log p_\theta$, so the gradient of an expectation is an expectation too:
 # $\nabla \sum p_\theta \cdot \text{return} = E[\text{return} \cdot \nabla \log p_\theta]$. The dynamics of the cart
 # do not depend on $\theta$ and drop out of $\nabla_\theta \log p_\theta$. Only the scores remain. $G_t$ may replace the
-# return, since an action does not change earlier rewards (page 5), and $b_t$ may be subtracted, since scores have mean
-# zero (page 2).
+# return, since an action does not change earlier rewards (page 5). A $b_t$ that depends neither on $a_t$ nor on what
+# follows it may be subtracted, since scores have mean zero (pages 2 and 6).
 
 # %%
 import torch as th

@@ -91,15 +91,17 @@ truth = 0.25 * 0.8 ** np.arange(10)
 is_exact = {}
 
 figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
-for (name, weight), colour in zip(weights.items(), ("#0072B2", "#D55E00"), strict=True):
+for (name, weight), colour, shift in zip(weights.items(), ("#0072B2", "#D55E00"), (-0.1, 0.1), strict=True):
     (gradients,) = gradients_by_episode(rollout, weight)
     # The weights of "off" come first, then those of "on"
     by_switch = gradients[:, 10:20].numpy()
     mean, standard_error = by_switch.mean(axis=0), by_switch.std(axis=0) / len(by_switch) ** 0.5
-    ax.errorbar(range(10), mean, 2 * standard_error, fmt="o", color=colour, label=f"{name} (± 2 standard errors)")
+    label = f"{name} (± 2 standard errors)"
+    ax.errorbar(np.arange(10) + shift, mean, 2 * standard_error, fmt="o", color=colour, label=label)
     is_exact[name] = (np.abs(mean - truth) < 4.5 * standard_error).all()
 assert is_exact["with γᵗ"] and not is_exact["without γᵗ"]
-ax.plot(truth, color="black", label="exact")
+ax.plot(truth, color="black", label="exact: γᵗ / 4")
+ax.axhline(0.25, color="black", linestyle="--", label="1 / 4, the gradient without a discount")
 ax.set(title="Ten switches, 4000 episodes", xlabel="time step t", ylabel="derivative by the logit of switch t")
 ax.legend(frameon=False)
 plt.show()
@@ -111,8 +113,8 @@ plt.show()
 # is better. A sum of gradients divided by the number of *steps* is a ratio of two random numbers, and gives long
 # episodes too little weight; with one episode per update it even points to the short way. Divided by the number of
 # *episodes* the gradient is unbiased (`normalize_by="episodes"`). The bias falls as the number of episodes in an update
-# grows. The default is the biased choice, `normalize_by="steps"`, whose steps have the scale of A2C's. Here the
-# sums divided by steps are multiplied by the mean length, to compare them.
+# grows. The default, `normalize_by="steps"`, is biased. It gives the updates the scale of A2C's. Here the sums divided
+# by steps are multiplied by the mean length, to compare them.
 
 # %%
 # The score of the logit of "short" is 1/2 for the short way and -1/2 for the long one

@@ -224,7 +224,7 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
         arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
         arrows.set(label=f"{name} ({len(x)})", edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
-    ax.set(xlabel="first direction, in multiples of its norm", ylabel="second direction, in multiples of its norm")
+    ax.set(xlabel="first direction, in units of ‖θ‖", ylabel="second direction, in units of ‖θ‖")
     points = f"{len(scape.scales)} × {len(scape.scales)} points of {scape.n_episodes} episodes"
     ax.set_title(f"Utility on a plane through θ (the dot)\n{points}")
     if scape.steps:
