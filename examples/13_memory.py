@@ -66,8 +66,8 @@ class TMaze(gym.Env):
 
 # %% [markdown]
 # The memory is an Elman network with orthogonal weights, which keeps a signal for long. The gates of an LSTM start half
-# open, and the cue fades; `--forget-bias 2` keeps it longer. Exploration must outlast the discovery that the cue
-# matters, so the entropy bonus falls to 0 over the training.
+# open, and the cue fades; `--forget-bias 2` keeps it longer. The policy must still explore when it discovers that the
+# cue matters, so the entropy bonus falls to 0 only at the end.
 
 # %%
 settings = {
