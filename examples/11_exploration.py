@@ -57,10 +57,10 @@ assert means[0.0] < -0.7 and means[1.5] > 1
 # ## Temperature and entropy
 #
 # Two arguments keep a policy of discrete actions random, and both can be schedules. `temperature` divides the logits:
-# $\pi(a \mid s) \propto \exp(z_a / T)$. `ent_coef` rewards entropy: the objective is $E[\text{return}] + c \, E[\sum_t
-# H(\pi(\cdot \mid s_t))]$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. The
-# policy starts with a probability of 0.999 for the worst arm, and hardly sees the others. Without a schedule it mostly
-# stays there. A schedule lets it try them first, and decide later.
+# $\pi(a \mid s) \propto \exp(z_a / T)$. `ent_coef` adds $c \sum_t \nabla H(\pi(\cdot \mid s_t))$ to the gradient, which
+# for one step is the gradient of $E[\text{return}] + c H$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of
+# standard deviation 1. The policy starts with a probability of 0.999 for the worst arm, and hardly sees the others.
+# Without a schedule it mostly stays there. A schedule lets it try them first, and decide later.
 
 
 # %%

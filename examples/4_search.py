@@ -55,8 +55,8 @@ assert mean > 450, mean
 # ## Coordinates or random directions?
 #
 # Perturb one parameter at a time ("coordinate"), or all at once? Then each change may be normal ("gaussian"), $\pm 1$
-# ("rademacher"), or the perturbation has a fixed length ("sphere"). For a linear utility whose differences have
-# independent noise of variance 1, as central differences have, the variance of $\hat g$ is the trace of
+# ("rademacher"), or the perturbation has a fixed length ("sphere"). For a linear utility whose differences have noise
+# of variance 1, independent as in central differences, the variance of $\hat g$ is the trace of
 # $(\Delta^T \Delta)^{-1}$, where the rows of $\Delta$ are the perturbations.
 
 # %%

@@ -75,8 +75,8 @@ plt.show()
 # An untrained critic knows nothing of the future: at $\lambda = 0$ every weight is almost the same, and neither signal
 # nor noise is left. A trained one keeps most of the gradient, with less noise than at $\lambda = 1$. The usual
 # $\lambda = 0.95$ then has less noise too, and a bias that 300 episodes hardly show (0.00: none is detected). At
-# $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors. Trust a critic as
-# long as bias and noise together fall: here, some $\lambda$ below 1 is best.
+# $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors. Lower $\lambda$
+# as long as bias and noise together fall: here some $\lambda$ below 1 is best.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()

@@ -30,10 +30,6 @@ def check_kind(name: str, value: Any, kinds: tuple[Any, ...], allowed: str = "")
     return value
 
 
-# A name or the user's own function
-check_name = partial(check_kind, kinds=(str, Callable), allowed="a name or a callable")
-
-
 def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> ValueError:
     """Make the error for a name that is none of some, with the nearest one."""
     known = {each.lower(): each for each in names}
@@ -78,7 +74,8 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
 
 def check_function(name: str, value: Any, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
     """Return the user's own function, or one of ours by its name; the error lists the names."""
-    function: Callable[..., Any] | None = value if callable(value) else functions.get(check_name(name, value))
+    check_kind(name, value, (str, Callable), "a name or a callable")
+    function: Callable[..., Any] | None = value if callable(value) else functions.get(value)
     if function is None:
         raise unknown_name(name, "a callable or one of", functions, value)
     return function

@@ -221,8 +221,8 @@ class BasePolicyGradient(Distributed):
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
         :param exact_match: Whether there must be a state for everything that has one here, and nothing else. If not,
-            some may be missing. FiniteDifference leaves out REINFORCE's ``critic_optimizer``; parameters with other
-            names, and the state of another kind of optimizer, are left out with a warning
+            some may be missing, and FiniteDifference leaves out REINFORCE's ``critic_optimizer``. With a warning,
+            parameters with other names and the state of another kind of optimizer are left out
         :param device: Device on which the parameters are loaded
         :raises TypeError: If an argument is of the wrong type, or a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or
@@ -239,9 +239,10 @@ class BasePolicyGradient(Distributed):
         storage.check_finite_state(own, storage.may_be_infinite(self.policy))
         before: Any = deepcopy(self.get_parameters())
         try:
-            # The policy comes first, and with it a mismatch that is named by its parameters
-            for name, state in own.items():
-                storage.load_state(recursive_getattr(self, name), name, state, exact_match)
+            # First the policy, whose mismatch is named by its parameters. The optimizers' states belong to all of these
+            if "policy" not in own or storage.load_policy(self.policy, own.pop("policy"), exact_match):
+                for name, state in own.items():
+                    storage.load_optimizer(recursive_getattr(self, name), name, state, exact_match)
         except BaseException:
             super().set_parameters(before)
             raise

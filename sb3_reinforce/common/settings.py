@@ -21,7 +21,6 @@ from sb3_reinforce.common.arguments import (
     check_function,
     check_integer,
     check_kind,
-    check_name,
     check_number,
     check_subclass,
     choose,
@@ -84,6 +83,7 @@ def check_verbose(name: str, value: Any) -> int:
 
 
 check_count = partial(check_integer, low=1)
+# The classes add the arguments that name functions
 COMMON_ARGUMENTS: dict[str, Check] = {
     "policy": partial(check_kind, kinds=(str, type), allowed="a name or a class"),
     "learning_rate": partial(CheckedSchedule, high=MAX_LEARNING_RATE),
@@ -103,7 +103,6 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "gae_lambda": partial(check_number, low=0, high=1),
     "ent_coef": CheckedSchedule,
     "vf_coef": partial(check_number, low=0),
-    "baseline": check_name,
     "n_episodes": optional(check_count),
     "episodes_per_start": check_count,
     "reward_to_go": check_flag,
@@ -123,8 +122,6 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "target_kl": optional(CheckedSchedule),
 }
 FINITE_DIFFERENCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
-    "estimator": check_name,
-    "perturbation": check_name,
     "n_delta": optional(check_count),
     "delta_std": optional(partial(CheckedSchedule, above=True, high=MAX_STD)),
     "n_eval_episodes": check_count,

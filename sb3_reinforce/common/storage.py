@@ -149,17 +149,21 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
     return ""
 
 
-def load_state(part: Any, name: str, state: Any, exact_match: bool) -> None:
-    """Load the state of a module or an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
-    if isinstance(part, th.nn.Module):
-        left = part.load_state_dict(state, strict=exact_match)
-        if left.missing_keys or left.unexpected_keys:
-            warnings.warn(
-                f"load_path_or_dict[{name!r}] has other names than this {type(part).__name__}: nothing for "
-                f"{left.missing_keys}, which stay as they are, and {left.unexpected_keys}, which are left out",
-                stacklevel=3,
-            )
-        return
+def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: bool) -> bool:
+    """Load the parameters of a policy, and return whether they were all there, and no others."""
+    missing, others = policy.load_state_dict(state, strict=exact_match)
+    if len(others) == len(state):
+        raise ValueError(f"load_path_or_dict['policy'] has no parameter of {type(policy).__name__}, got {others}")
+    if missing:
+        warnings.warn(f"load_path_or_dict['policy'] has no {', '.join(missing)}: they stay as they are", stacklevel=3)
+    if others:
+        kind = type(policy).__name__
+        warnings.warn(f"{kind} has no {', '.join(others)} of load_path_or_dict['policy']: left out", stacklevel=3)
+    return not (missing or others)
+
+
+def load_optimizer(part: th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
+    """Load the state of an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
     reason = optimizer_mismatch(part, state)
     needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
     if reason and exact_match:

@@ -100,7 +100,8 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     for key, value in hyperparams.items():
         try:
             yaml.unsafe_load(yaml.dump(value))
-        except (yaml.YAMLError, TypeError, AttributeError) as error:
+        except Exception as error:
+            # Reading back calls whatever the text names
             raise ConfigurationError(
                 f"{key} cannot be read again from the config.yml beside the model: put functions and classes into a "
                 f"module that can be imported ({error})"

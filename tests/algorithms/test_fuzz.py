@@ -17,9 +17,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, REINFORCE_ARGUMENTS
 
-TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
+TABLES = {algorithm: algorithm._arguments for algorithm in (REINFORCE, FiniteDifference)}
 
 N_EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", 100))
 fuzzed = settings(
@@ -116,9 +115,9 @@ LEFT_OUT = {
 
 def test_every_argument_is_drawn_or_left_out():
     own = REINFORCE_STRATEGIES | WITH_CRITIC | OF_A_BOX | OF_NUMBERS | OF_A_NATURAL_STEP
-    assert own.keys() | LEFT_OUT | {"step", "n_steps", "n_episodes"} == REINFORCE_ARGUMENTS.keys()
+    assert own.keys() | LEFT_OUT | {"step", "n_steps", "n_episodes"} == TABLES[REINFORCE].keys()
     searched = FINITE_DIFFERENCE_STRATEGIES.keys() | WITH_PAIRS.keys() | {"n_delta"}
-    assert searched | LEFT_OUT >= FINITE_DIFFERENCE_ARGUMENTS.keys() >= searched
+    assert searched | LEFT_OUT >= TABLES[FiniteDifference].keys() >= searched
 
 
 @st.composite

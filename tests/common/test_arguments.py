@@ -18,11 +18,11 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
-from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, LEARN_ARGUMENTS, REINFORCE_ARGUMENTS
+from sb3_reinforce.common.settings import LEARN_ARGUMENTS
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
 
 NAN, INF = float("nan"), float("inf")
-TABLES = {REINFORCE: REINFORCE_ARGUMENTS, FiniteDifference: FINITE_DIFFERENCE_ARGUMENTS}
+TABLES = {algorithm: algorithm._arguments for algorithm in (REINFORCE, FiniteDifference)}
 NO_NUMBERS = ["x", True, [1], 1j, None]
 WRONG = {
     "check_number": [*NO_NUMBERS, NAN, INF, -INF],
@@ -32,6 +32,7 @@ WRONG = {
     "check_flag": ["no", 1, None],
     "check_choice": ["batch", 3, None],
     "check_kind": [3, [1], None, b"mean"],
+    "check_named": [3, [1], None, b"mean", "men"],
     "check_subclass": [3, "x", dict],
     "check_device": ["gpu9", 3],
     "check_callback": [3, "x", [3], BaseCallback, [BaseCallback]],
@@ -74,7 +75,7 @@ def wrong_values(name, check):
 
 
 def test_every_number_has_a_range():
-    tables = REINFORCE_ARGUMENTS | FINITE_DIFFERENCE_ARGUMENTS | LEARN_ARGUMENTS
+    tables = TABLES[REINFORCE] | TABLES[FiniteDifference] | LEARN_ARGUMENTS
     assert {name for name, check in tables.items() if kind_of(check)[0] in HAVE_RANGES} == OUTSIDE.keys()
 
 
@@ -102,7 +103,7 @@ USED_BEFORE = {
     ("kind", "name"),
     [
         (kind, name)
-        for kind, table in {"steps": REINFORCE_ARGUMENTS, "search": FINITE_DIFFERENCE_ARGUMENTS}.items()
+        for kind, table in zip(("steps", "search"), TABLES.values(), strict=True)
         for name in sorted(table.keys() - USED_BEFORE)
     ],
 )

@@ -9,9 +9,10 @@ from sb3_reinforce.common.optimization import fuse, step
 
 @pytest.mark.parametrize("chosen", [{"foreach": False}, {"foreach": True}, {"fused": False}, {"differentiable": True}])
 def test_the_users_choice_of_an_implementation_is_kept(chosen):
-    adam = th.optim.Adam([nn.Parameter(th.zeros(1))], **chosen)
-    fuse(adam)
-    assert not adam.param_groups[0]["fused"]
+    default, adam = (th.optim.Adam([nn.Parameter(th.zeros(1))], **each) for each in ({}, chosen))
+    for optimizer in (default, adam):
+        fuse(optimizer)
+    assert default.param_groups[0]["fused"] and not adam.param_groups[0]["fused"]
 
 
 @pytest.mark.parametrize("fused", [True, False])

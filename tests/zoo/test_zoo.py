@@ -47,7 +47,7 @@ def test_train_finds_the_settings_without_a_conf_file(name, folder):
 @pytest.mark.parametrize("name", NAMES)
 def test_enjoy(name, folder, capsys):
     for which in ((), ("--load-best",), ("--load-last-checkpoint",)):
-        zoo("enjoy", "--algo", name, "--fold", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
+        zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
         assert "Mean reward: " in capsys.readouterr().out
 
 
