@@ -66,10 +66,10 @@ assert large[-1] < 0.88 and 0.93 < medium[-1] < batch[-1] < 0.99 < small[-1]
 assert small[40] < 0.62 and small[400] < 0.93 and baseline[20] > 0.99 and baseline[-1] > 0.9992
 
 # %% [markdown]
-# The large step with one episode ends on the wrong action in many runs. The small step loses none, but it is slow. With
-# twenty episodes a step eight times as large loses only a few runs in a hundred. For the same data this gains little: a
-# rate of 0.2 with one episode is the same rate per episode, and loses 3 to 5 runs in a hundred. The baseline makes the
-# difference. With it, the rate of 4 is the fastest and loses no run.
+# The large step with one episode ends on the wrong action in many runs. The small step loses none, but it is slow at
+# first. With twenty episodes a step eight times as large loses only a few runs in a hundred. For the same data this
+# gains little: a rate of 0.2 with one episode is the same rate per episode, and loses 3 to 5 runs in a hundred. The
+# baseline makes the difference. With it, the rate of 4 is the fastest and loses no run.
 #
 # ## How noisy is the gradient of a real run?
 #
