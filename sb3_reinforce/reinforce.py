@@ -117,7 +117,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. A
         schedule that falls to 0 ends with an almost deterministic policy, which is how policies are evaluated
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
-        after each step; 0 for no floor
+        after each step; 0 for no floor. It can be a schedule: if it falls to 0, the policy explores at first, and its
+        noise may shrink later
     :param max_episode_steps: With ``n_episodes``, the length beyond which an episode raises an error
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE) instead of action noise
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE; -1: only before each rollout
@@ -173,7 +174,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         batch_size: int = 256,
         critic_learning_rate: float | Schedule | None = None,
         temperature: float | Schedule = 1.0,
-        min_std: float = 0.0,
+        min_std: float | Schedule = 0.0,
         max_episode_steps: int = 100_000,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
@@ -290,7 +291,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _apply_temperature_and_floor(self) -> None:
         set_temperature(self.policy, self._scheduled("temperature"))
-        floor_std(self.policy, self.min_std)
+        floor_std(self.policy, self._scheduled("min_std"))
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int | None

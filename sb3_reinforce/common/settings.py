@@ -112,7 +112,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "batch_size": check_count,
     "critic_learning_rate": optional(partial(CheckedSchedule, high=MAX_LEARNING_RATE)),
     "temperature": partial(CheckedSchedule, above=True, may_reach=True, high=MAX_TEMPERATURE),
-    "min_std": partial(check_number, low=0, high=MAX_STD),
+    "min_std": partial(CheckedSchedule, high=MAX_STD),
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),
     "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
@@ -181,7 +181,7 @@ def check_reinforce(model: Any) -> None:
     if isinstance(model.action_space, spaces.Box):
         if model.temperature != 1:
             raise ValueError(f"temperature={model.temperature!r} is for discrete actions, not for {model.action_space}")
-    elif model.min_std > 0:
+    elif model.min_std != 0:
         raise ValueError(f"min_std={model.min_std!r} is for Box action spaces, not for {model.action_space}")
 
 

@@ -102,7 +102,10 @@ FINITE_DIFFERENCE_STRATEGIES = COMMON | {
 
 # Arguments that go with a critic, with a kind of actions, or with a kind of step
 WITH_CRITIC = {"gae_lambda": floats(0, 1), "critic_learning_rate": st.one_of(st.none(), floats(0, 1))}
-OF_A_BOX = {"min_std": floats(0, 2), "use_sde": st.booleans(), "sde_sample_freq": st.integers(-1, 4)}
+OF_A_BOX = {
+    "min_std": st.one_of(floats(0, 2), st.just(lambda p: 2 * p)), "use_sde": st.booleans(),
+    "sde_sample_freq": st.integers(-1, 4),
+}  # fmt: skip
 OF_NUMBERS = {"temperature": st.one_of(floats(0.1, 10), st.just(lambda p: 0.5 * p))}
 OF_A_NATURAL_STEP = {"target_kl": st.one_of(st.none(), floats(0, 0.1), st.just(lambda p: 0.01 * p))}
 WITH_PAIRS = {"n_top": st.integers(1, 2)}

@@ -113,6 +113,17 @@ def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
     assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
 
 
+def test_a_floor_follows_its_schedule():
+    def narrow(model):
+        model.policy.log_std.data.fill_(-9.0)
+
+    floor = LinearSchedule(0.8, 0.0, 1.0)
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=16, min_std=floor, learning_rate=0.0, device="cpu")
+    stds = Record(lambda model: model.policy.log_std.exp().item(), at="step")
+    model.learn(64, callback=[Record(narrow, at="rollout_start"), stds])
+    assert stds.records == pytest.approx([0.8] * 16 + [0.6] * 16 + [0.4] * 16 + [0.2] * 16)
+
+
 def test_min_std_above_1_is_refused_where_the_deviation_is_no_exponential():
     arguments = {"use_sde": True, "policy_kwargs": {"use_expln": True, "log_std_init": -3.0}}
     policy = REINFORCE("MlpPolicy", "Pendulum-v1", min_std=0.5, **arguments).policy
