@@ -7,6 +7,7 @@ from functools import wraps
 from itertools import zip_longest
 from typing import Any, ClassVar, TypeVar, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -23,7 +24,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 # The arguments that may differ between processes
 OWN_ARGUMENTS = {"verbose", "device", "tensorboard_log"}
 # The attributes of process 0 that all take over before they collect; a ``_last_obs`` of None lets all reset too
-SHARED = (bool, int, float, str, type(None), th.Generator)
+SHARED = (bool, int, float, np.number, str, type(None), th.Generator)
 
 
 def together(learn: Learn) -> Learn:

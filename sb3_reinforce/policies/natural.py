@@ -23,7 +23,8 @@ from sb3_reinforce.policies.evaluation import Parameters, action_distribution
 from sb3_reinforce.policies.parameters import write
 
 DEFAULT_TARGET_KL = 0.01
-# The damping c of SB3-Contrib's TRPO for one action, and the number of iterations of Schulman et al. (2015, appendix C)
+# The damping c of SB3-Contrib's TRPO where actions have one dimension, and the number of iterations of Schulman et al.
+# (2015, appendix C)
 DAMPING = 0.1
 N_ITERATIONS = 10
 # A step whose measured divergence exceeds the target by this factor is shortened, by half at most

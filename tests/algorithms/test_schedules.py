@@ -113,15 +113,23 @@ def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
     assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
 
 
-def test_a_floor_follows_its_schedule():
+@pytest.mark.parametrize("use_sde", [True, False])
+def test_a_floor_follows_its_schedule(use_sde, tmp_path):
     def narrow(model):
         model.policy.log_std.data.fill_(-9.0)
 
-    floor = LinearSchedule(0.8, 0.0, 1.0)
-    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=16, min_std=floor, learning_rate=0.0, device="cpu")
-    stds = Record(lambda model: model.policy.log_std.exp().item(), at="step")
-    model.learn(64, callback=[Record(narrow, at="rollout_start"), stds])
-    assert stds.records == pytest.approx([0.8] * 16 + [0.6] * 16 + [0.4] * 16 + [0.2] * 16)
+    kwargs = {"min_std": LinearSchedule(0.8, 0.4, 1.0), "n_steps": 16, "learning_rate": 0.0, "use_sde": use_sde}
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", **kwargs, device="cpu")
+    stds = Record(lambda model: model.policy.log_std.exp().mean().item(), at="step")
+    model.learn(64, callback=[Record(narrow, at="rollout_start"), Record(narrow, at="rollout_end"), stds])
+    assert stds.records == pytest.approx([0.8] * 16 + [0.7] * 16 + [0.6] * 16 + [0.5] * 16)
+    # A model that is saved has the floor of the progress made
+    assert model.policy.log_std.exp().mean().item() == pytest.approx(0.4)
+    model.save(tmp_path / "model")
+    model = REINFORCE.load(tmp_path / "model", env=model.env)
+    narrow(model)
+    model.learn(16, callback=stds)
+    assert stds.records[-1] == pytest.approx(0.8)
 
 
 def test_min_std_above_1_is_refused_where_the_deviation_is_no_exponential():

@@ -95,7 +95,6 @@ def test_a_wrong_argument_is_named_with_its_value(algorithm, name):
 
 USED_BEFORE = {
     "policy", "policy_kwargs", "tensorboard_log", "stats_window_size", "verbose", "seed", "device", "use_sde",
-    "min_std",
 }  # fmt: skip
 
 
@@ -172,6 +171,7 @@ RECURRENT, MASKABLE = (
         ("episodes", {"baseline": "time_mean", "n_episodes": 1}, ["at least 2", "'time_mean'"]),
         ("episodes", {"baseline": BASELINES["time_mean"], "n_episodes": 1}, ["at least 2", "'time_mean'"]),
         ("steps", {"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
+        ("steps", {"min_std": lambda progress: 0.0}, ["min_std=<function", "Discrete"]),
         ("steps", {"env": "Pendulum-v1", "temperature": 0.5}, ["temperature", "Box"]),
         ("steps", {"env": "Pendulum-v1", "temperature": lambda progress: 1.0}, ["temperature", "Box"]),
         ("steps", {"target_kl": 0.01}, ["target_kl=0.01", "step='optimizer'", "'natural'"]),

@@ -239,6 +239,12 @@ def observations_of_all(rank):
     return model.rollout_buffer.observations.argmax(-1).T.tolist()
 
 
+def test_numbers_of_numpy_reach_the_other_processes():
+    model = make("steps")
+    model.learning_rate = np.float32(0.25)
+    assert model.shared_state()["attributes"]["learning_rate"] == 0.25
+
+
 def test_after_common_starts_the_environments_of_all_processes_are_independent(tmp_path):
     def learn(rank):
         env = make_vec_env("Pendulum-v1", 4, seed=0)
