@@ -229,7 +229,7 @@ def test_the_policy_can_be_copied_where_a_callback_has_measured(env):
         return all(map(th.equal, copy.deepcopy(model.policy).parameters(), model.policy.parameters()))
 
     copies = Record(can_be_copied)
-    model = make("episodes", env, baseline="optimal")
+    model = make("episodes", gym.make(env, max_episode_steps=20), baseline="optimal")
     model.learn(1, [PitfallCallback(), GradientQualityCallback(1), copies])
     assert copies.records == [True]
     for measure in (compare_baselines, landscape):
