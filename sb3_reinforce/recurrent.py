@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, stack, take
+from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, take
 from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.critic import next_values_of
 from sb3_reinforce.policies.evaluation import Route
@@ -186,7 +186,7 @@ class RecurrentREINFORCE(REINFORCE):
         n_steps, n_envs = dones.shape
         steps, envs = np.array([*((n_steps - 1, env) for env in range(n_envs)), *terminal_obs]).T
         following = take(rows, (steps, envs))
-        observed = [columns.last_obs, *(stack([obs]) for obs in terminal_obs.values())]
+        observed = [columns.last_obs, *terminal_obs.values()]
         following["observations"] = concatenate(*(shaped_like(following["observations"], obs) for obs in observed))
         # An episode that has ended with the rollout does not go on in the next observation, whose V is not asked for
         following["sequence"][:n_envs][th.as_tensor(dones[-1])] = -1

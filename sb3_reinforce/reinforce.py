@@ -34,7 +34,7 @@ from sb3_reinforce.envs.starts import has_given_seeds, start_episodes, start_gro
 from sb3_reinforce.estimation import BASELINES, Baseline, Rollout
 from sb3_reinforce.estimation.rollout import Running, in_finished_episode
 from sb3_reinforce.estimation.weights import Batch, complete_rollout, training_batch
-from sb3_reinforce.policies.critic import fit_critic, values_after, values_along
+from sb3_reinforce.policies.critic import fit_critic, rollout_values
 from sb3_reinforce.policies.evaluation import (
     Parameters,
     Route,
@@ -421,8 +421,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""
-        values = values_along(self.policy, route, buffer)
-        return values, values_after(self.policy, route, values, columns.dones, columns.last_obs, columns.terminal_obs)
+        return rollout_values(self.policy, route, buffer, columns.dones, columns.last_obs, columns.terminal_obs)
 
     @uninterrupted
     def train(self) -> None:

@@ -18,7 +18,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
-from sb3_reinforce.policies.critic import values_after, values_along
+from sb3_reinforce.policies.critic import rollout_values
 from sb3_reinforce.policies.evaluation import route_of
 
 GAMMA = 0.5
@@ -78,8 +78,8 @@ def rollout_of(model, batch):
     next_values = None
     if model.has_critic:
         route = route_of(model.policy, with_critic=True)
-        buffer.values = values_along(model.policy, route, buffer)
-        next_values = values_after(model.policy, route, buffer.values, dones, buffer.observations[-1], {})
+        last_obs = buffer.observations[-1]
+        buffer.values, next_values = rollout_values(model.policy, route, buffer, dones, last_obs, {})
     rollout, *_ = complete_rollout(
         buffer,
         model.policy,

@@ -179,9 +179,6 @@ class PitfallCallback(Diagnosis):
         self.n_updates = 0
         self.rollout: Rollout | None = None
 
-    def _on_training_start(self) -> None:
-        self.total_timesteps: int = self.locals["total_timesteps"]
-
     def _on_rollout_end(self) -> None:
         rollout: Rollout = self.model.rollout
         self.rollout = rollout
@@ -210,7 +207,7 @@ class PitfallCallback(Diagnosis):
         self.updates.append(self._update(self.rollout))
         self.n_updates += 1
         self.rollout = None
-        progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.total_timesteps)
+        progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.locals["total_timesteps"])
         history = History(self.model, list(self.updates), self.n_updates, progress_remaining)
         for name, pitfall in PITFALLS.items():
             is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)

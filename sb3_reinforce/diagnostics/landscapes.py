@@ -60,7 +60,7 @@ class CandidateUtility:
         """
         candidates = check_candidates("thetas must be", thetas, len(self.theta)).reshape(-1, len(self.theta))
         seeds = seeds_of(thetas.shape, self.n_episodes, self.seed)
-        self.seed = int(seeds.max()) + 1
+        self.seed = int(seeds[-1, -1]) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)
         with undisturbed(self.model):
             self.model.policy.set_training_mode(False)

@@ -82,29 +82,23 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     return ax
 
 
-def interquartile_mean(scores: Floats) -> Floats:
-    """The mean of the middle half of scores (n_scores, ...), shape (...) (Agarwal et al., 2021, section 4.3)."""
-    ordered = np.sort(scores, axis=0)
-    cut = len(scores) // 4
-    middle: Floats = ordered[cut : len(scores) - cut].mean(axis=0)
-    return middle
-
-
 def interquartile_interval(
     runs: Floats, n_resamples: int, confidence: float, seed: int
 ) -> tuple[Floats, Floats, Floats]:
     """
     Interquartile mean of runs (n_runs, n_tasks, n_points) and its percentile interval, each of shape (n_points,).
 
-    The bootstrap resamples the runs of each task separately (Agarwal et al., 2021, section 4.1).
+    The bootstrap resamples the runs of each task separately (Agarwal et al., 2021, sections 4.1 and 4.3).
     """
+    from scipy.stats import trim_mean
+
     n_runs, n_tasks, n_points = runs.shape
     generator = np.random.default_rng(seed)
     tasks = np.arange(n_tasks)
     drawn = (runs[generator.integers(n_runs, size=(n_runs, n_tasks)), tasks] for _ in range(n_resamples))
-    resampled = np.stack([interquartile_mean(sample.reshape(-1, n_points)) for sample in drawn])
+    resampled = np.stack([trim_mean(sample.reshape(-1, n_points), 0.25) for sample in drawn])
     low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
-    return interquartile_mean(runs.reshape(-1, n_points)), low, high
+    return trim_mean(runs.reshape(-1, n_points), 0.25), low, high
 
 
 def plot_learning_curves(

@@ -22,32 +22,27 @@ Value: TypeAlias = Callable[[Any], th.Tensor]
 
 
 @th.no_grad()
-def values_along(policy: ActorCriticPolicy, route: Route, buffer: RolloutBuffer) -> np.ndarray:
-    """V(s_t) of shape ``(n_steps, n_envs)``, float32: in one batch, unless it came along with the actions."""
-    if route.forward:
-        return buffer.values
-    obs = flatten(obs_as_tensor(buffer.observations, policy.device))
-    return value_function(policy, route)(obs).reshape(buffer.rewards.shape).cpu().numpy()
-
-
-@th.no_grad()
-def values_after(
+def rollout_values(
     policy: ActorCriticPolicy,
     route: Route,
-    values: np.ndarray,
+    buffer: RolloutBuffer,
     dones: NDArray[np.bool_],
     last_obs: Any,
     terminal_obs: dict[tuple[int, int], Any],
-) -> np.ndarray:
-    """V(s_{t+1}) of shape ``(n_steps, n_envs)``: 0 after a terminal state, V(terminal observation) at a time limit."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """V(s_t), in one batch unless it came along with the actions, and V(s_{t+1}): float32 ``(n_steps, n_envs)``."""
     value = value_function(policy, route)
 
     def predict(obs: Any) -> np.ndarray:
         return value(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
 
+    values = buffer.values
+    if not route.forward:
+        obs = flatten(obs_as_tensor(buffer.observations, policy.device))
+        values = value(obs).reshape(dones.shape).cpu().numpy()
     last_values = predict(last_obs)
     terminal_values = predict(stack(list(terminal_obs.values()))) if terminal_obs else ()
-    return next_values_of(values, dones, last_values, terminal_obs, terminal_values)
+    return values, next_values_of(values, dones, last_values, terminal_obs, terminal_values)
 
 
 def next_values_of(

@@ -136,14 +136,31 @@ def test_what_a_callback_changes_is_checked():
         model.learn(64, callback=change)
 
 
+class NoiseFromZero(gym.Env):
+    """All episodes start at 0 and take two steps; the second observation is noise."""
+
+    observation_space = spaces.Box(-10.0, 10.0, (1,))
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.np_random.normal(size=1).astype(np.float32), 1.0, self.t == 2, False, {}
+
+
 def test_pending_seeds_are_used_up():
-    env = make_vec_env("Pendulum-v1", 4, seed=0)
-    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0).learn(1)
-    env.seed(3)
-    starts = first_observations()
-    model.learn(1, callback=starts, reset_num_timesteps=False)
-    (rows,) = starts.records
-    assert (rows[0] == rows[1]).all() and (rows[1] != rows[2]).any()
+    """A callback seeds the environments, whose first observations say nothing about their seeds."""
+    env = DummyVecEnv([NoiseFromZero] * 4)
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0)
+    second = Record(lambda model: model.rollout_buffer.observations[1])
+    model.learn(16, callback=[Record(lambda model: env.seed(3), "rollout_start"), second])
+    assert len(second.records) == 2
+    for rows in second.records:
+        assert rows[0] == rows[1] != rows[2] == rows[3]
 
 
 @pytest.mark.parametrize("at", ["step", "rollout_end"])
