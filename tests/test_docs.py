@@ -184,6 +184,11 @@ def test_the_table_of_ppos_arguments_has_their_defaults():
                 assert inspect.signature(model.learn).parameters[name].default == int(default)
                 found += 1
     assert found >= 16
+    # start.md says so of those that are not in the table
+    ours, theirs = (inspect.signature(algorithm).parameters for algorithm in (REINFORCE, PPO))
+    others = {name for name in ours.keys() & theirs.keys() if f"`{name}`" not in table and name != "policy"}
+    assert {"gamma", "ent_coef", "use_sde", "policy_kwargs", "max_grad_norm"} <= others
+    assert {name: ours[name].default for name in others} == {name: theirs[name].default for name in others}
     assert inspect.signature(FiniteDifference.learn).parameters["log_interval"].default == 1
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
+from gymnasium import spaces
 from models import KINDS, all_kinds, make
 from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import (
@@ -107,6 +108,25 @@ def test_the_log_of_a_search(tmp_path):
     folders = {"train": train, "rollout": rollout, "time": clock}
     assert log.keys() == {f"{folder}/{key}" for folder, keys in folders.items() for key in keys.split()}
     assert np.isfinite(list(log.values())).all() and log["time/total_timesteps"] == model.num_timesteps
+
+
+@all_kinds
+def test_the_log_interval(kind, tmp_path):
+    model = make(kind, Corridor((3,)))
+    model.set_logger(configure(str(tmp_path), ["json"]))
+    model.learn(60, log_interval=2)
+    model.logger.close()
+    rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    assert [row["time/iterations"] for row in rows] == list(range(2, model._n_updates + 1, 2)) != []
+
+
+def test_the_logged_standard_deviation_is_the_mean_over_the_actions():
+    env = Corridor(action_space=spaces.Box(-1, 1, (2,)))
+    model = make("steps", env, n_steps=6, learning_rate=0.0)
+    with th.no_grad():
+        model.policy.log_std.copy_(th.tensor([0.5, -1.0]))
+    std = model.learn(6).logger.name_to_value["train/std"]
+    assert std == pytest.approx((np.exp(0.5) + np.exp(-1.0)) / 2)
 
 
 def test_tensorboard(tmp_path):

@@ -82,15 +82,21 @@ def test_spaces(kind, observation_space, action_space, policy):
 
 
 @pytest.mark.parametrize("squash_output", [False, True])
-@pytest.mark.parametrize(("sde_sample_freq", "draws"), [(-1, 1), (4, 3)])
-def test_gsde(squash_output, sde_sample_freq, draws, monkeypatch):
+@pytest.mark.parametrize(("sde_sample_freq", "steps"), [(-1, [0]), (4, [0, 0, 4])])
+def test_gsde(squash_output, sde_sample_freq, steps, monkeypatch):
     kwargs = {"policy_kwargs": {"net_arch": [8], "squash_output": squash_output}}
     env = make_vec_env("Pendulum-v1", 2)
     model = make("steps", env, use_sde=True, sde_sample_freq=sde_sample_freq, ent_coef=0.01, **kwargs)
-    calls, reset_noise = [], model.policy.reset_noise
-    monkeypatch.setattr(model.policy, "reset_noise", lambda *args: calls.append(args) or reset_noise(*args))
+    drawn, reset_noise = [], model.policy.reset_noise
+
+    def draw(n_envs):
+        assert n_envs == 2
+        drawn.append(model.num_timesteps // 2 % model.n_steps)
+        reset_noise(n_envs)
+
+    monkeypatch.setattr(model.policy, "reset_noise", draw)
     assert_trains(model)
-    assert calls == [(2,)] * draws * model._n_updates
+    assert drawn == steps * model._n_updates
 
 
 @all_kinds

@@ -108,16 +108,29 @@ def test_the_fit_of_central_differences_is_the_regression_within_pairs():
     assert logged["train/standard_error"] == pytest.approx((variance / (2 * x @ x)) ** 0.5)
 
 
-def test_utilities_that_differ_by_rounding_make_no_step():
+@pytest.mark.parametrize("level", [0.7, -200.0, 1e6])
+def test_utilities_that_differ_by_rounding_make_no_step(level):
     callback = Record(lambda model: None)
     model = make(Line(), learning_rate=0.0, policy_kwargs={"optimizer_class": th.optim.SGD}).learn(1, callback)
     estimate = model.estimate_gradient(callback)
     theta = model.theta
     model.learning_rate = 1.0
-    equal = 0.7 + 1e-16 * th.arange(6.0).double()
+    equal = level + abs(level) * 1.5e-16 * th.arange(6.0).double()
     model.train(replace(estimate, utilities=equal, gradient=1e-15 * estimate.gradient))
     assert equal.std() > 0
     th.testing.assert_close(model.theta, theta)
+    model.train(replace(estimate, utilities=level + th.arange(6.0).double()))
+    assert not th.allclose(model.theta, theta)
+
+
+def test_the_mean_of_the_standard_errors_is_logged():
+    callback = Record(lambda model: None)
+    model = make(estimator="regression", n_delta=30, learning_rate=0.0).learn(1, callback)
+    estimate = model.estimate_gradient(callback)
+    model.train(estimate)
+    errors = fit_quality(estimate.candidates, estimate.utilities, estimate.gradient, estimate.columns).standard_error
+    assert errors.std() > 0
+    assert model.logger.name_to_value["train/standard_error"] == pytest.approx(float(errors.mean()))
 
 
 def test_n_top_uses_the_best_pair():
@@ -211,7 +224,14 @@ def test_the_rule_of_thumb():
 
 def test_perturbations_are_one_percent_of_theta_or_a_twentieth():
     assert default_delta_std(th.full((4,), 10.0)) == pytest.approx(0.2) and default_delta_std(th.zeros(4)) == 0.05
-    assert make().learn(1, log_interval=None).logger.name_to_value["train/delta_std"] == 0.05
+    model = make()
+    for weight in (0.0, 10.0):
+        with th.no_grad():
+            model.policy.action_net.weight.fill_(weight)
+        expected = default_delta_std(model.theta)
+        model.learn(1, log_interval=None)
+        assert model.logger.name_to_value["train/delta_std"] == pytest.approx(expected)
+    assert expected > 0.05
 
 
 @pytest.mark.slow

@@ -49,6 +49,17 @@ def test_schedules_are_followed():
     assert temperatures.records[-1] == pytest.approx(2.0)
 
 
+def test_the_schedule_of_the_entropy_bonus_is_followed():
+    """At the end of training the gradient is the one without a bonus, if the schedule has fallen to 0."""
+    norms = []
+    for ent_coef in (lambda progress: 100.0 * (progress > 0.75), 0.0, 100.0):
+        model = make("steps", ent_coef=ent_coef, learning_rate=0.0, max_grad_norm=None, seed=0)
+        with th.no_grad():
+            model.policy.action_net.bias[0] = 2.0
+        norms.append(model.learn(16).logger.name_to_value["train/grad_norm"])
+    assert norms[0] == pytest.approx(norms[1]) and norms[2] > 2 * norms[1]
+
+
 @pytest.mark.parametrize("kind", ["steps", "search"])
 @pytest.mark.parametrize(("name", "value"), [("learning_rate", 0.25), ("lr_schedule", lambda progress: 0.25)])
 def test_a_learning_rate_set_later_is_the_rate_of_each_optimizer(name, value, kind):

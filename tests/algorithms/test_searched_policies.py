@@ -43,6 +43,18 @@ def test_vec_normalize_is_frozen_in_an_update_and_learns_between(norm_obs):
         assert env.obs_rms.count == count and not env.training
 
 
+def test_vec_normalize_learns_from_the_original_observations():
+    env = VecNormalize(make_vec_env("CartPole-v1", 2, seed=0))
+    before = Record(lambda model: copy.deepcopy(env.obs_rms), "rollout_start")
+    seen = Record(lambda model: env.get_original_obs(), "step")
+    make(env).learn(1, [before, seen])
+    (expected,) = before.records
+    for obs in seen.records:
+        expected.update(obs)
+    np.testing.assert_allclose(env.obs_rms.mean, expected.mean, rtol=1e-9)
+    np.testing.assert_allclose(env.obs_rms.var, expected.var, rtol=1e-9)
+
+
 def test_a_callback_may_stop_the_statistics_of_vec_normalize():
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     make(env).learn(60, At(3, lambda model: setattr(env, "training", False)))

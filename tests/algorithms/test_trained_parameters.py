@@ -231,6 +231,17 @@ def test_a_callback_finds_the_gradients_of_the_last_update():
     assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-5)
 
 
+def test_each_pass_of_the_critic_draws_all_steps_in_a_new_order():
+    model = make("steps", Corridor((40,)), n_steps=40, n_critic_updates=2, batch_size=8, seed=0)
+    seen = []
+    network = model.policy.mlp_extractor.value_net
+    network.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].argmax(1)))
+    model.learn(40)
+    first, second = th.cat(seen[-10:-5]).tolist(), th.cat(seen[-5:]).tolist()
+    assert sorted(first) == sorted(second) == list(range(40))
+    assert first != second and list(range(40)) not in (first, second)
+
+
 def test_no_minibatch_of_the_critic_has_one_step():
     kwargs = {"features_extractor_class": Normalized, "share_features_extractor": False, "net_arch": [4]}
     model = make("steps", n_steps=9, batch_size=4, policy_kwargs=kwargs)

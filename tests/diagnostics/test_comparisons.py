@@ -101,10 +101,13 @@ def test_the_floor_is_the_best_constant_of_each_component():
         assert residual[k] <= min(tried)
 
 
-@pytest.mark.parametrize("floats", [1, 5000, 2**26])
-def test_rows_are_the_variances_of_the_gradients_however_much_of_these_is_held(monkeypatch, floats):
+@pytest.mark.parametrize(("floats", "discount_scores"), [(1, False), (5000, True), (2**26, False)])
+def test_rows_are_the_variances_of_the_gradients_however_much_is_held(monkeypatch, floats, discount_scores):
     env = make_vec_env("CartPole-v1", 3, seed=1)
-    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": [5]}, seed=1, device="cpu")
+    model = REINFORCE(
+        "MlpPolicy", env, gamma=0.9, discount_scores=discount_scores, policy_kwargs={"net_arch": [5]}, seed=1,
+        device="cpu",
+    )  # fmt: skip
     sizes = []
 
     def blocks(*args):
@@ -120,12 +123,13 @@ def test_rows_are_the_variances_of_the_gradients_however_much_of_these_is_held(m
     th.manual_seed(5)
     model.env.seed(7)
     rollout = sample(model, 6)
+    discounts = 0.9 ** (discount_scores * rollout.timesteps.double())
     for name, baseline in BASELINES.items():
-        weights = rollout.discounts * (rollout.returns - baseline(rollout))
+        weights = discounts * (rollout.returns - baseline(rollout))
         gradients = gradients_by_episode(rollout, weights)[0].double()
         assert table[name].variance.value == pytest.approx(float(gradients.var(0).sum()), rel=1e-4)
         assert table[name].seconds > 0
-    weighted, scores = gradients_by_episode(rollout, rollout.discounts * rollout.returns, rollout.discounts).double()
+    weighted, scores = gradients_by_episode(rollout, discounts * rollout.returns, discounts).double()
     floor = float(componentwise_residuals(weighted, scores).var(0).sum())
     assert table["floor"].variance.value == pytest.approx(floor, rel=1e-4)
 

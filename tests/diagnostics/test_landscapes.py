@@ -49,6 +49,13 @@ def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
     assert (error.abs() <= 4.5 * gradients.std(0) / 4000**0.5).all()
 
 
+def test_the_likelihood_ratio_has_the_mean_of_the_others_as_baseline():
+    """Without it a return of 1000 or 1001 would leave gradients of some hundreds."""
+    env = make_vec_env(lambda: Corridor((1,), lambda t, action: 1000.0 + action), 4, seed=0)
+    model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+    assert likelihood_ratio(model, 200)[0].std(0).max() < 2
+
+
 def test_pictures_without_matplotlib_say_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "sb3_reinforce.diagnostics.plots", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
@@ -69,6 +76,13 @@ def test_the_estimators_take_the_perturbations_that_a_search_takes(perturbation,
     else:
         with pytest.raises(ValueError, match=sentence):
             compare_estimators(bandit(), 4, 3, perturbation=perturbation)
+
+
+def test_the_steps_of_each_estimator_are_those_of_its_episodes():
+    """All of one step, in eight environments: U(θ), which the forward difference needs too, makes each take one."""
+    table = compare_estimators(bandit(), 8, 3, perturbation="sphere", n_delta=16, n_resamples=5)
+    expected = {"likelihood_ratio": 1, "forward": 16 + 8, "central": 2 * 16, "regression": 16}
+    assert {row.estimator: row.steps for row in table} == expected
 
 
 @pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])

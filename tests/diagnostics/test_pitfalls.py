@@ -210,6 +210,17 @@ def test_noise_wider_than_the_actions_is_all_the_randomness_there_is():
     assert found == pytest.approx([1.0, 0.5])
 
 
+@th.no_grad()
+@pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 5]), spaces.MultiBinary(3)], ids=str)
+def test_a_uniform_policy_is_all_random(space):
+    policy = REINFORCE("MlpPolicy", Corridor(action_space=space), device="cpu").policy
+    policy.action_net.weight.zero_()
+    obs = th.zeros(1, *policy.observation_space.shape)
+    entropy = float(policy.get_distribution(obs).entropy())
+    assert randomness(policy, obs, entropy) == pytest.approx(1.0)
+    assert randomness(policy, obs, entropy / 4) == pytest.approx(0.25)
+
+
 class Own(spaces.Discrete):
     """A custom space."""
 

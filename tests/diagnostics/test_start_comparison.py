@@ -51,10 +51,12 @@ def test_an_environment_that_ignores_seeds_is_refused():
         compare_starts(make_model(ignores_seed=True))
 
 
+@pytest.mark.parametrize("discount_scores", [False, True])
 @pytest.mark.parametrize("env", [lambda: Tree(ragged=True), lambda: Corridor((1, 2, 6), lambda t, a: t + a)])
-def test_ragged_episodes_have_the_gradients_of_training(env):
+def test_ragged_episodes_have_the_gradients_of_training(env, discount_scores):
     """The lengths differ within groups of eight, or between them; the baseline is the one that training would have."""
-    model = REINFORCE("MlpPolicy", DummyVecEnv([env] * 8), baseline="leave_one_out", seed=0)
+    arguments = {"baseline": "leave_one_out", "gamma": 0.5, "discount_scores": discount_scores}
+    model = REINFORCE("MlpPolicy", DummyVecEnv([env] * 8), seed=0, **arguments)
     rollouts = sample_starts(model, 8)
     returns = by_start([rollout.returns * rollout.used for rollout in rollouts])
     used = by_start([rollout.used.double() for rollout in rollouts])
@@ -64,7 +66,8 @@ def test_ragged_episodes_have_the_gradients_of_training(env):
         means = []
         for rollout in rollouts:
             grouped = replace(rollout, episodes_per_start=m)
-            [gradients] = gradients_by_episode(grouped, grouped.returns - leave_one_out(grouped))
+            discounts = 0.5 ** (discount_scores * rollout.timesteps.double())
+            [gradients] = gradients_by_episode(grouped, discounts * (grouped.returns - leave_one_out(grouped)))
             means.append(gradients.double().reshape(-1, m, gradients.shape[1]).mean(1))
         found = th.stack(means)
         expected = gram(found.mean(1))

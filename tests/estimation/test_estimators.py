@@ -101,6 +101,13 @@ def test_n_top_is_the_central_difference_of_the_best_perturbations():
         th.testing.assert_close(estimate, central_difference(utility, theta, rows))
 
 
+def test_n_top_ranks_a_pair_by_its_better_utility():
+    """As in ARS: the pair (5, −9) comes before (1, 0.5), whose mean is higher."""
+    utilities = th.tensor([[5.0, 1.0], [-9.0, 0.5]]).double()
+    estimate = central_difference(lambda x: utilities, th.zeros(2).double(), th.eye(2).double(), n_top=1)
+    assert estimate.tolist() == [7.0, 0.0]
+
+
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_design_without_direction_is_an_error_before_anything_is_evaluated(name):
     def utility(x):

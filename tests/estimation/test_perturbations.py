@@ -19,10 +19,12 @@ def test_shape_type_and_reproducibility(name):
     assert not th.equal(first, other)
 
 
-@pytest.mark.parametrize("name", ["sphere", "gaussian", "rademacher"])
-def test_random_directions_have_mean_zero_and_identity_covariance(name):
+@pytest.mark.parametrize(("name", "fourth_moment"), [("sphere", 3 * 4 / (4 + 2)), ("gaussian", 3), ("rademacher", 1)])
+def test_moments_of_random_directions(name, fourth_moment):
+    """Mean zero, identity covariance, and E δ_i⁴ of each kind, in four dimensions."""
     k = 100_000
     deltas = PERTURBATIONS[name](k, 4, generator())
+    assert abs(deltas.pow(4).mean() - fourth_moment) <= 5 * deltas.pow(4).std() / k**0.5
     # Standard errors: 1/√k of a mean, at most √2/√k of a second moment; five of them
     th.testing.assert_close(deltas.mean(0), th.zeros(4).double(), rtol=0, atol=5 * k**-0.5)
     th.testing.assert_close(deltas.T @ deltas / k, th.eye(4).double(), rtol=0, atol=5 * (2 / k) ** 0.5)
@@ -47,6 +49,8 @@ def test_coordinates_visit_all_parameters_with_alternating_sign():
         assert (rows.sum(1) == sign).all()
     assert th.equal(deltas.abs().sum(1), th.ones(10).double())
     assert (deltas[8:].sum(1) == 1).all()
+    first, second, third = coordinate(60, 20, generator()).abs().argmax(1).split(20)
+    assert first.tolist() != second.tolist() != third.tolist()
 
 
 @pytest.mark.parametrize(("k", "n"), [(10, 5), (64, 42), (21, 43), (64, 300)])

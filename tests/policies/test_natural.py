@@ -10,7 +10,7 @@ import torch as th
 from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
-from models import Normalized
+from models import Normalized, make
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -232,6 +232,22 @@ def test_every_baseline_return_and_rollout_takes_it(baseline, reward_to_go, roll
     found = divergences_of(model, 120)
     assert len(found) >= 2
     np.testing.assert_allclose(found, 0.01, rtol=0.2)
+
+
+def test_the_entropy_bonus_is_part_of_its_direction():
+    changes = []
+    for ent_coef in (0.0, 100.0):
+        model = make("steps", n_steps=64, step="natural", ent_coef=ent_coef, seed=0)
+        with th.no_grad():
+            model.policy.action_net.bias[0] = 2.0
+            obs = th.as_tensor(model.env.reset())
+            before = model.policy.get_distribution(obs).entropy()
+        model.learn(64)
+        assert model.logger.name_to_value["train/grad_norm"] > 0
+        with th.no_grad():
+            changes.append(float(model.policy.get_distribution(obs).entropy() - before))
+    # A step of that divergence along the entropy alone raises it by about √(2 · 0.01 Var log π)
+    assert changes[1] > 0.05 and changes[1] > changes[0] + 0.01
 
 
 def test_where_no_step_is_possible_the_parameters_stay():

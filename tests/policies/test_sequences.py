@@ -83,6 +83,11 @@ def test_the_critic_s_state_after_a_rollout(network):
     th.testing.assert_close(following, values[DONES.size :], **EXACT)
 
 
+def test_minibatches_have_a_new_order():
+    orders = {tuple(th.cat(list(sequence_minibatches(th.arange(40), 1))).tolist()) for _ in range(3)}
+    assert len(orders | {tuple(range(40))}) == 4
+
+
 @pytest.mark.parametrize("size", [1, 4, 7, 100])
 def test_minibatches_are_whole_sequences(size):
     sequence = th.as_tensor(episode_numbers(th.as_tensor(DONES)).flatten())
@@ -114,3 +119,10 @@ def test_gates_start_orthogonal(memory):
     policy = type(model.policy)(**model.policy._get_constructor_parameters())
     for gate in policy.lstm_actor.weight_hh_l0.split(4):
         th.testing.assert_close(gate @ gate.T, th.eye(4), atol=1e-5, rtol=0)
+    for gate in policy.lstm_actor.weight_ih_l0.split(4):
+        th.testing.assert_close(gate.T @ gate, th.eye(gate.shape[1]), atol=1e-5, rtol=0)
+    assert not policy.lstm_actor.bias_hh_l0.any() and not policy.lstm_actor.bias_ih_l0.any()
+    # As PyTorch does: uniform in ±1/√n
+    model = make_recurrent(double=False, policy_kwargs={"memory": memory, "ortho_init": False})
+    weight = type(model.policy)(**model.policy._get_constructor_parameters()).lstm_actor.weight_hh_l0
+    assert weight.abs().max() <= 0.5 and weight.split(4)[0].norm() < 1.9

@@ -73,6 +73,17 @@ def test_a_cut_episode_without_a_critic_is_left_out_with_a_warning():
     assert model.logger.name_to_value["rollout/complete_fraction"] == 0.8
 
 
+def test_the_fraction_of_complete_steps_is_logged_with_a_critic_too():
+    model = make_model(lambda: Corridor((4,)), 1, n_steps=10).learn(10)
+    assert model.rollout.used.all() and model.logger.name_to_value["rollout/complete_fraction"] == 0.8
+
+
+def test_there_is_no_rollout_while_one_is_collected():
+    rollouts = Record(lambda model: model.rollout, "step")
+    assert make_model(lambda: Corridor((4,)), 1, n_steps=4).learn(8, rollouts).rollout is not None
+    assert rollouts.records == [None] * 8
+
+
 def test_the_fraction_of_used_steps_is_logged():
     model = make_model(lambda: Corridor((4,)), 3, n_episodes=4, baseline="none").learn(10)
     assert model.logger.name_to_value["rollout/used_fraction"] == pytest.approx(16 / 24)
@@ -177,6 +188,19 @@ def test_the_critic_is_fitted_to_returns_to_go_also_with_the_total_return(baseli
     arguments = {"gamma": 1.0, "n_steps": 6, "baseline": baseline, "reward_to_go": False}
     model = make_model(lambda: Corridor((3,)), **arguments).learn(6)
     assert model.rollout_buffer.returns.ravel().tolist() == expected
+
+
+def test_the_total_return_of_an_episode_that_spans_rollouts():
+    """Rewards are powers of ten, and V is 0; after set_env another episode begins."""
+    env = make_vec_env(lambda: Corridor((10,), lambda t, action: 10.0**t), 1)
+    model = REINFORCE("MlpPolicy", env, n_steps=3, reward_to_go=False, gamma=1.0, learning_rate=0.0, device="cpu")
+    with th.no_grad():
+        model.policy.value_net.weight.zero_()
+    returns = Record(lambda model: model.rollout.returns[:, 0].tolist())
+    model.learn(9, returns)
+    model.set_env(env)
+    model.learn(3, returns, reset_num_timesteps=False)
+    assert returns.records == [[each] * 3 for each in (111.0, 111_111.0, 111_111_111.0, 111.0)]
 
 
 @pytest.mark.parametrize("algorithm", [REINFORCE, A2C])
