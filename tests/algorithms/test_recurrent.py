@@ -158,14 +158,11 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
     env = make_vec_env(lambda: Random(SPACES[name], lengths=(2, 5, 9), truncate=truncate), 2, seed=0)
     model = make_recurrent(name, env, n_steps=n_steps, n_episodes=None if n_steps else 4, learning_rate=0.0)
     records = Record(lambda model: (model.rollout, model._last_obs, copy_of(model.rollout_buffer)))
-    values = []
-    evaluate_critic = model._evaluate_critic
-    model._evaluate_critic = lambda *args: values.append(evaluate_critic(*args)) or values[-1]
     ends = Ends()
     model.learn(60, [records, ends, switch])
     first = 0
     running = [[], []]
-    for (rollout, last_obs, (starts, log_probs)), (own, own_next) in zip(records.records, values, strict=True):
+    for rollout, last_obs, (starts, log_probs) in records.records:
         # The actor's steps and the sequences of training have one log π
         actions = rollout.actions.flatten().long()
         trained_on = log_prob_of(model.policy, flatten(rollout.inputs), actions)
@@ -175,7 +172,7 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
                 running[env] = []
             running[env].append(take(rollout.observations, (t, env)))
             logits, value = outputs_of(model.policy, running[env])
-            assert own[t, env] == pytest.approx(value, abs=1e-6)
+            assert float(rollout.values[t, env]) == pytest.approx(value, abs=1e-6)
             assert log_probs[t, env] == pytest.approx(float(logits[int(rollout.actions[t, env])]), abs=1e-6)
             is_last = bool(rollout.dones[t, env])
             if is_last:
@@ -185,7 +182,7 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
                 following = take(after, env)
             expected = 0.0 if following is None else outputs_of(model.policy, [*running[env], following])[1]
             if rollout.used[t, env]:
-                assert own_next[t, env] == pytest.approx(expected, abs=1e-6)
+                assert float(rollout.next_values[t, env]) == pytest.approx(expected, abs=1e-6)
         first += len(rollout.dones)
 
 

@@ -117,6 +117,7 @@ def test_a_policy_acts_alike_before_a_save_and_after_a_load(tmp_path):
     loaded, obs = type(model).load(tmp_path / "model"), th.randn(64, 4)
     assert th.equal(*(each.policy.get_distribution(obs).distribution.probs for each in (model, loaded)))
     assert np.array_equal(*(each.predict(obs.numpy(), deterministic=True)[0] for each in (model, loaded)))
+    assert model.rollout is not None and loaded.rollout is None
 
 
 def test_whole_episodes_go_on_from_one_reset(tmp_path):

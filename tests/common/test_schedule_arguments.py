@@ -37,8 +37,8 @@ def test_a_schedule_is_called_once_where_its_value_is_needed_once():
     n_before = len(seen)
     model.learn(80)
     assert len(seen) - n_before == model._n_updates == 10
-    # Before Stable-Baselines3 has the argument, and when the model keeps it, both at both ends
-    assert seen[:n_before] == [1.0, 0.0] * 2
+    # At construction it is checked at both ends
+    assert set(seen[:n_before]) == {0.0, 1.0}
 
 
 @both
