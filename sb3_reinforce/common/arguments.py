@@ -128,7 +128,12 @@ class CheckedSchedule(FloatSchedule):
 
 def optional(check: Check) -> Check:
     """Let a check pass None."""
-    return lambda name, value: None if value is None else check(name, value)
+    return partial(check_unless_none, check=check)
+
+
+def check_unless_none(name: str, value: Any, check: Check) -> Any:
+    """Check a value that may also be None."""
+    return None if value is None else check(name, value)
 
 
 def choose(model: Any, name: str, value: int) -> None:
