@@ -59,7 +59,7 @@ class BasePolicyGradient(Distributed):
         if needs_env or env is not None:
             env = check_env(env, verbose)
             check_noise(kwargs.get("use_sde", False), env.action_space)
-        # A copy: Stable-Baselines3 writes to it
+        # A copy, which the user's later changes do not reach
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         self._chosen_defaults: dict[str, int] = {}

@@ -61,7 +61,7 @@ class Distributed(BaseAlgorithm):
         rank, _ = rank_and_size()
         if rank > 0:
             # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions
-            seed = (th.initial_seed() % 2**31 if seed is None else seed) + rank * self.n_envs
+            seed = ((th.initial_seed() if seed is None else seed) + rank * self.n_envs) % 2**31
         super().set_random_seed(seed)
 
     def check_same(self) -> None:

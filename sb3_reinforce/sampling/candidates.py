@@ -72,7 +72,7 @@ class EpisodeTracker:
             else:
                 # Its last candidate acts on in it: these steps are counted, and otherwise ignored
                 self.active[env] = False
-        self.deadline = self.max_episode_steps + int(self.started_at[self.active].min(initial=self.clock))
+        self.deadline = self.max_episode_steps + int(self.started_at.min())
         return restarted
 
 

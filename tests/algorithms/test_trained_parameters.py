@@ -279,3 +279,11 @@ def test_environments_that_a_callback_sets_at_the_start_of_a_rollout_are_used_in
     used = Record(lambda model: (used.locals["env"] is model.env, model.env is other), "step")
     make(kind, env).learn(100, [switch, used])
     assert all(is_own for is_own, _ in used.records) and used.records[-1] == (True, True)
+
+
+def test_the_logged_loss_of_the_critic_is_the_mean_over_its_minibatches():
+    """A critic that stands still has the loss of the whole rollout."""
+    model = make("steps", n_steps=8, batch_size=4, critic_learning_rate=0.0, seed=0).learn(8)
+    buffer = model.rollout_buffer
+    loss = float(((buffer.returns - buffer.values) ** 2).mean())
+    assert model.logger.name_to_value["train/value_loss"] == pytest.approx(loss, rel=1e-4)

@@ -10,6 +10,7 @@ from environments import Corridor, Random
 from gymnasium import spaces
 from models import KINDS, both, make
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 
@@ -195,3 +196,17 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
     search.policy.action_net.requires_grad_(False)
     search.n_delta = None
     assert search.learn(1).n_delta == 40
+
+
+@both
+def test_load_replaces_other_attributes_as_stable_baselines3_does(kind, tmp_path):
+    make(kind, Corridor()).learn(8).save(tmp_path / "model")
+    assert KINDS[kind][0].load(tmp_path / "model", device="cpu", num_timesteps=0).num_timesteps == 0
+
+
+def test_what_the_user_has_set_later_is_kept_at_load(tmp_path):
+    model = REINFORCE("MlpPolicy", DummyVecEnv([Corridor]), device="cpu")
+    assert model.n_steps == 32
+    model.n_steps = 64
+    model.save(tmp_path / "model")
+    assert REINFORCE.load(tmp_path / "model", env=DummyVecEnv([Corridor] * 2), device="cpu").n_steps == 64

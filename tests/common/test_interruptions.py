@@ -12,6 +12,7 @@ from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.common.interruptions import interruptible, uninterrupted
 
 
 @pytest.fixture(autouse=True)
@@ -128,3 +129,12 @@ def test_training_in_another_thread_sets_no_handlers():
     thread.join()
     # An exception in the thread would be a warning, and so an error
     assert model.num_timesteps == 64
+
+
+def test_a_block_within_a_block_waits_for_the_end_of_both():
+    finished = []
+    with pytest.raises(KeyboardInterrupt), interruptible(), uninterrupted:
+        with uninterrupted:
+            signal.raise_signal(signal.SIGINT)
+        finished.append(True)
+    assert finished

@@ -33,3 +33,16 @@ def test_a_step_takes_a_gradient_of_another_precision():
     parameter = nn.Parameter(th.zeros(2))
     step(th.optim.SGD([parameter], lr=1.0), [parameter], [th.tensor([1.0, 2.0]).half()], None, "policy")
     assert parameter.tolist() == [-1, -2]
+
+
+def test_a_subclass_of_an_optimizer_is_left_alone():
+    own = type("Own", (th.optim.Adam,), {})([th.nn.Parameter(th.zeros(1))])
+    fuse(own)
+    assert own.param_groups[0]["fused"] is None
+
+
+def test_without_a_gradient_nothing_moves():
+    """Not by weight decay either, where a batch uses no trained parameter."""
+    parameter = th.nn.Parameter(th.ones(1))
+    assert step(th.optim.SGD([parameter], lr=1.0, weight_decay=1.0), [parameter], [None], None, "critic") == 0
+    assert parameter.item() == 1

@@ -15,6 +15,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
+from sb3_reinforce.common import distribution
 from sb3_reinforce.common.moments import seen_since
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -293,3 +294,9 @@ def test_a_default_is_chosen_again_for_another_number_of_processes(tmp_path):
 
     assert load(0) == 16
     assert in_processes(2, load, tmp_path) == [24, 24]
+
+
+def test_the_largest_seed_serves_all_processes(monkeypatch):
+    """NumPy takes no larger one."""
+    monkeypatch.setattr(distribution, "rank_and_size", lambda: (1, 2))
+    make("steps", Corridor(), seed=2**32 - 1).learn(8)

@@ -11,6 +11,7 @@ from models import KINDS, both, make, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 NAN = float("nan")
 
@@ -33,6 +34,11 @@ def not_finite(state):
     return {key: value * NAN for key, value in state.items()}
 
 
+def further_moments(states):
+    moments = states["policy.optimizer"]["state"]
+    return optimizer_with(states, state={**moments, 99: next(iter(moments.values()))})
+
+
 WRONG = {
     "nothing": lambda p: {},
     "an unknown name": lambda p: {**p, "foo": {}},
@@ -49,6 +55,7 @@ WRONG = {
     "another optimizer's setting": lambda p: groups_with(p, betas="x"),
     "another optimizer's groups": lambda p: optimizer_with(p, param_groups=[{"params": [0]}] * 2),
     "another optimizer's moments": lambda p: moments_with(p, lambda moments: {**moments, "exp_avg": th.zeros(3, 77)}),
+    "another optimizer's further moments": further_moments,
     "another optimizer's missing moments": lambda p: moments_with(p, lambda moments: {"step": moments["step"]}),
 }
 
@@ -190,3 +197,28 @@ def test_a_mask_may_be_infinite(kind, tmp_path):
         states["policy"][name] = th.tensor([0.0, number])
         with pytest.raises(ValueError, match="finite"):
             model.set_parameters(states)
+
+
+def test_a_search_leaves_out_the_critics_optimizer():
+    other, model = make("steps", Corridor()).learn(8), make("search", Corridor())
+    with pytest.raises(ValueError, match="nothing else"):
+        model.set_parameters(other.get_parameters())
+    model.set_parameters(other.get_parameters(), exact_match=False)
+    assert plain(model.policy.state_dict()) == plain(other.policy.state_dict())
+
+
+class Infinite(FlattenExtractor):
+    """Shared by actor and critic, it is known by three names."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.register_buffer("mask", th.full((2,), float("inf")))
+        self.frozen = th.nn.Parameter(self.mask.clone(), requires_grad=False)
+
+
+@both
+def test_a_mask_of_a_shared_extractor_may_be_infinite(kind, tmp_path):
+    kwargs = {"features_extractor_class": Infinite, "net_arch": [4]}
+    make(kind, Corridor(), policy_kwargs=kwargs).save(tmp_path / "model")
+    extractor = KINDS[kind][0].load(tmp_path / "model", device="cpu").policy.features_extractor
+    assert extractor.mask.isinf().all() and extractor.frozen.isinf().all()

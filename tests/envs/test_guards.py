@@ -7,13 +7,15 @@ import cloudpickle
 import numpy as np
 import pytest
 from callbacks import At
-from environments import Faulty, Wrapper, of_two
+from environments import Corridor, Faulty, Wrapper, of_two
 from gymnasium import spaces
 from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
+
+from sb3_reinforce.envs.checks import BadData, check_finite
 
 NAN, INF = float("nan"), float("inf")
 bare_or_normalized = pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
@@ -104,7 +106,7 @@ def test_an_observation_of_the_very_last_step(truncate):
     at = 7 if truncate else 8
     model = make("steps", Faulty("observation", at=at, value=bad(NAN), truncate=truncate), n_steps=at)
     before = plain(model.policy.state_dict())
-    with pytest.raises(ValueError, match="observation of environment 0"):
+    with pytest.raises(ValueError, match=rf"observation of environment 0 at step {at - truncate} "):
         model.learn(at)
     assert plain(model.policy.state_dict()) == before
 
@@ -261,3 +263,15 @@ def test_learning_within_a_callback(fault, kind):
         make(kind, env).learn(400, callback=At(3, lambda model: other.learn(24)))
     assert other.num_timesteps == 32
     assert_finite_statistics(env)
+
+
+@pytest.mark.parametrize("value", [4e38, -1e39, 1e200])
+def test_what_float32_cannot_hold_is_named_whatever_numpy_warns_of(value):
+    with np.errstate(over="raise"), pytest.raises(BadData, match=r"of environment 1 is not finite.*float32 ends at"):
+        check_finite("The reward", np.array([0.0, value]), (None,))
+
+
+def test_discounts_may_underflow():
+    """Also for users who let NumPy raise errors."""
+    with np.errstate(under="raise"):
+        make("episodes", Corridor((330,)), gamma=0.1).learn(1)

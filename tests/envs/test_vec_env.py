@@ -210,6 +210,8 @@ def test_pictures_in_one_array():
     env = synced(Corridor)
     env.env.render = lambda: np.zeros((N_ENVS, 4, 4, 3))
     assert [picture.shape for picture in env.get_images()] == [(4, 4, 3)] * N_ENVS
+    env.env.render = lambda: None
+    assert env.get_images() == [None] * N_ENVS
 
 
 def test_pictures():
@@ -359,7 +361,40 @@ def test_environments_of_one_class_with_different_modes(mode, monkeypatch):
     assert all(step(adapter)[2].all() for _ in range(3))
 
 
-def test_a_wrapper_that_forgets_the_episodes_that_go_on_is_refused():
+def test_each_row_that_is_no_box_is_checked():
+    class Wrong(SyncVectorEnv):
+        def step(self, actions):
+            obs, *rest = super().step(actions)
+            return obs + np.array([[0], [9], [0]]), *rest
+
+    env = synced(lambda: Random(spaces.MultiDiscrete([2, 3])), vector_env=Wrong)
+    env.reset()
+    with pytest.raises(ValueError, match=r"observation of environment 1 must be in MultiDiscrete"):
+        env.step(np.zeros(N_ENVS, int))
+
+
+def test_only_gymnasiums_own_cart_pole_is_reset_within_the_step():
+    own = type("Own", (CartPoleVectorEnv,), {})
+    for env in (own(N_ENVS), VectorWrapper(CartPoleVectorEnv(N_ENVS))):
+        with pytest.raises(ValueError, match=r"autoreset_mode.*SAME_STEP"):
+            GymnasiumVecEnv(env)
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, VectorWrapper])
+def test_a_wrapper_that_forgets_the_episodes_that_go_on_is_refused(wrapper):
     env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(ValueError, match="use VecNormalize"):
-        GymnasiumVecEnv(NormalizeReward(env))
+        GymnasiumVecEnv(wrapper(NormalizeReward(env)))
+
+
+def test_a_malformed_last_observation_is_named():
+    class Cut(SyncVectorEnv):
+        def step(self, actions):
+            *rest, infos = super().step(actions)
+            if "final_obs" in infos:
+                infos["final_obs"][1] = infos["final_obs"][1][:1]
+            return *rest, infos
+
+    env = synced(lambda: Corridor((2,), truncate=True), vector_env=Cut)
+    with pytest.raises(ValueError, match=r"observation of environment 1 must have shape \(2,\)"):
+        make("steps", env).learn(16)

@@ -5,14 +5,16 @@ from functools import partial
 import numpy as np
 import pytest
 import torch as th
+from callbacks import At
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import moved_by_learning
+from models import Scaled, moved_by_learning
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.policies.critic import minibatches
 from sb3_reinforce.policies.evaluation import evaluate, route_of
 from sb3_reinforce.policies.plain_mlp import plain_critic
 
@@ -154,3 +156,17 @@ def test_values_of_the_policy_step_are_those_of_predict_values(policy):
     assert (
         evaluate(model.policy, route_of(model.policy, True), obs, th.zeros(len(obs)), with_values=True)[2] == 3
     ).all()
+
+
+def test_values_are_those_of_the_policy_that_a_callback_has_set():
+    """Also of the steps before it, whose values had come along with the actions."""
+    kwargs = {"net_arch": [4], "features_extractor_class": Scaled}
+    model, other = (make(seed=seed, learning_rate=0.0, policy_kwargs=kwargs) for seed in range(2))
+    model.learn(1, At(3, lambda model: setattr(model, "policy", other.policy)))
+    with th.no_grad():
+        expected = other.policy.predict_values(observations(model.rollout_buffer))
+    np.testing.assert_allclose(model.rollout_buffer.values.reshape(-1, 1), expected, rtol=1e-5)
+
+
+def test_minibatches_of_one_step_are_kept():
+    assert [len(each) for each in minibatches(make().policy, None, 3, 1)] == [1, 1, 1]

@@ -1,11 +1,13 @@
 """The KL divergence of a step, as it is logged."""
 
+import math
 from copy import deepcopy
 
 import pytest
 import torch as th
 from callbacks import Record
 from enumeration import make_model
+from environments import Corridor
 from recurrent_models import make_recurrent
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -113,3 +115,11 @@ def test_the_divergence_of_a_recurrent_policy_is_evaluated_without_gradients(pol
     batch = training_batch(model.rollout, model.rollout_buffer, False)
     sampled_divergence(model.policy, route_of(model.policy), batch.observations, batch.actions, th.zeros(()))
     assert modes == [False]
+
+
+def test_the_divergence_of_outputs_that_are_not_finite_is_nan():
+    """The step is done, and the next rollout reports them."""
+    policy = REINFORCE("MlpPolicy", Corridor(), device="cpu").policy
+    with th.no_grad():
+        policy.action_net.bias.fill_(math.nan)
+    assert math.isnan(sampled_divergence(policy, route_of(policy), th.ones(2, 3), th.zeros(2), th.zeros(2)))

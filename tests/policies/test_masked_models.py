@@ -223,3 +223,30 @@ def test_an_environment_is_not_asked_for_the_actions_of_a_terminal_state(algorit
     steps = [env.step(int(env.unwrapped.action_masks().argmax())) for _ in range(3)]
     assert [terminated for _, _, terminated, *_ in steps] == [False, False, True]
     assert env.observation_space.contains(steps[-1][0]) and not steps[-1][0]["action_mask"].any()
+
+
+def test_a_dict_with_the_key_observation_keeps_its_other_parts():
+    """As of a goal environment."""
+    space = spaces.Dict({"observation": VECTOR, "desired_goal": VECTOR})
+    model = make("reinforce", ActionMaskObservation(Masked(space, spaces.Discrete(5)))).learn(16)
+    assert model.policy.features_dim == 6
+
+
+def test_the_mask_at_a_time_limit_is_the_environments():
+    """The state is not terminal, and its value stands in for what would have followed."""
+    env = environment()
+    env.reset(seed=0)
+    truncated = False
+    while not truncated:
+        action = int(env.unwrapped.action_masks().argmax())
+        env.unwrapped.action_masks = lambda: np.arange(5) == 2
+        obs, _, terminated, truncated, _ = env.step(action)
+        del env.unwrapped.action_masks
+    assert not terminated and obs["action_mask"].tolist() == [0, 0, 1, 0, 0]
+
+
+def test_a_mask_is_an_int8_array():
+    env = environment()
+    obs, _ = env.reset(seed=0)
+    following = env.step(int(env.unwrapped.action_masks().argmax()))[0]
+    assert [each["action_mask"].dtype for each in (obs, following)] == [np.int8] * 2

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from models import Normalized
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
@@ -12,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
+from sb3_reinforce.policies.parameters import searched_parameters
 
 OBS, ACTIONS = spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,))
 
@@ -102,3 +104,11 @@ def test_a_policy_moves_to_another_algorithm_and_back(algorithm: type[OnPolicyAl
 def test_the_bias_of_a_linear_policy_is_0(ortho_init: bool) -> None:
     policy = make(LinearPolicy, ortho_init=ortho_init)
     assert not policy.action_net.bias.any() and not policy.action_net.bias.requires_grad
+
+
+@pytest.mark.parametrize("mode", [True, False])
+def test_what_is_searched_is_read_in_evaluation_mode_and_the_mode_stays(mode):
+    """In training mode BatchNorm takes no single observation."""
+    policy = make(ActorCriticPolicy, features_extractor_class=Normalized, net_arch=[4])
+    policy.set_training_mode(mode)
+    assert len(searched_parameters(policy)) == 6 and policy.training == mode

@@ -8,7 +8,9 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_reinforce import REINFORCE
 from sb3_reinforce.policies import plain_mlp
+from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import DivideLogits, evaluate_layers, has_numpy_form, numpy_forward
 
 MLPS = {
@@ -83,3 +85,9 @@ def test_numpy_never_warns_as_pytorch_does_not():
     layer = nn.Linear(3, 2)
     nn.init.constant_(layer.weight, th.finfo(th.float32).max)
     assert np.isinf(numpy_forward([layer], 1)(np.ones((1, 3), dtype=np.float32))).all()
+
+
+def test_a_compiled_policy_is_called_itself():
+    """Its methods would bypass what was compiled."""
+    route = route_of(th.compile(REINFORCE("MlpPolicy", "CartPole-v1", device="cpu").policy, backend="eager"), True)
+    assert route.forward and route.evaluate_actions

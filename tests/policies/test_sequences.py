@@ -126,3 +126,24 @@ def test_gates_start_orthogonal(memory):
     model = make_recurrent(double=False, policy_kwargs={"memory": memory, "ortho_init": False})
     weight = type(model.policy)(**model.policy._get_constructor_parameters()).lstm_actor.weight_hh_l0
     assert weight.abs().max() <= 0.5 and weight.split(4)[0].norm() < 1.9
+
+
+def test_optimizers_have_the_users_arguments():
+    """Also the policy's, which is made again with its memories."""
+    kwargs = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.5}}
+    model = make_recurrent(policy_kwargs=kwargs)
+    for optimizer in (model.policy.optimizer, model.critic_optimizer):
+        assert optimizer.defaults["momentum"] == 0.5
+
+
+@pytest.mark.parametrize("with_lstm", [True, False])
+def test_the_critics_part_starts_orthogonal_too(with_lstm):
+    model = make_recurrent(double=False, policy_kwargs={"enable_critic_lstm": with_lstm})
+    policy = type(model.policy)(**model.policy._get_constructor_parameters())
+    weight = policy.lstm_critic.weight_ih_l0[:4] if with_lstm else policy.critic.weight
+    th.testing.assert_close(weight.T @ weight, th.eye(weight.shape[1]), atol=1e-5, rtol=0)
+
+
+def test_minibatches_of_equal_sequences_are_as_large_as_asked_for():
+    sequence = th.arange(6).repeat_interleave(2)
+    assert [len(rows) for rows in sequence_minibatches(sequence, 4)] == [4] * 3

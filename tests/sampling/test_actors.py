@@ -183,7 +183,33 @@ def new_part_of_the_extractor(model):
     model.policy.features_extractor.flatten = Negative()
 
 
+class Whole(th.nn.Module):
+    """A user's network without parts."""
+
+    def forward_actor(self, features):
+        return th.ones(len(features), 64)
+
+    def forward_critic(self, features):
+        return self.forward_actor(features)
+
+    def forward(self, features):
+        return self.forward_actor(features), self.forward_critic(features)
+
+
+def new_network(model):
+    model.policy.mlp_extractor = Whole()
+    prefer(model)
+
+
+def hook_on_the_body(model):
+    with th.no_grad():
+        model.policy.action_net.weight.copy_(OFFSET[:, None].expand(2, 64))
+    model.policy.mlp_extractor.policy_net.register_forward_hook(lambda module, x, latent: th.ones_like(latent))
+
+
 HOWS = {
+    "network": new_network,
+    "hook on the body": hook_on_the_body,
     "extractor": new_part_of_the_extractor,
     "distribution": new_distribution,
     "values": prefer,
@@ -205,3 +231,11 @@ def test_a_policy_that_a_callback_changes_acts_differently_at_once(how):
     assert 0 in actions[:10] and (actions[10:] == 1).all()
     log_probs = model.rollout_buffer.log_probs.ravel()
     assert (log_probs[:10] < -0.1).all() and np.allclose(log_probs[10:], 0, atol=1e-6)
+
+
+def test_a_deviation_that_a_callback_replaces_counts_at_once():
+    env = Corridor((5,), action_space=spaces.Box(-1, 1, (2,)))
+    model = REINFORCE("MlpPolicy", env, n_steps=40, learning_rate=0.0, seed=0, device="cpu")
+    model.learn(40, callback=At(10, lambda m: setattr(m.policy, "log_std", th.nn.Parameter(th.full((2,), -20.0)))))
+    actions = model.rollout_buffer.actions
+    assert np.abs(actions[:10]).max() > 0.5 and np.abs(actions[10:]).max() < 0.1

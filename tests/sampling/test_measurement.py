@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 from callbacks import Record
+from environments import Corridor, of_two
 from models import Scaled, all_kinds, make, plain
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
@@ -102,3 +103,25 @@ def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind):
     starts, ends = Record(measure, "rollout_start"), Record(measure, "rollout_end")
     model = make(kind).learn(50, [starts, Record(refused, "step"), ends])
     assert len(starts.records) == len(ends.records) == model._n_updates > 0
+
+
+def test_sigterm_ends_a_measurement_as_ctrl_c_does():
+    with undisturbed(make("steps", Corridor())):
+        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_after_a_measurement_episodes_go_on_from_rollout_to_rollout():
+    model = make("steps", Corridor((20,)))
+    landscape(model, n_points=2, n_episodes=1)
+    starts = Record(lambda model: bool(model.rollout_buffer.episode_starts[0]))
+    model.learn(16, starts)
+    assert starts.records == [True, False]
+
+
+@all_kinds
+def test_a_fault_is_named_in_a_measurement_too(kind):
+    """A DummyVecEnv would repeat the one number in the whole observation."""
+    model = make(kind, of_two(fault="observation", at=3, value=np.zeros(1)))
+    with pytest.raises(ValueError, match=r"observation of environment 1 must have shape \(7,\)"):
+        landscape(model, n_points=2, n_episodes=1)

@@ -102,6 +102,14 @@ def test_a_change_during_a_rollout_counts_at_once(change):
     assert set(kinds.records[:5]) == {LstmActor} and set(kinds.records[5:]) == {RecurrentPolicyActor}
 
 
+def test_new_memory_of_a_weight_counts_at_once():
+    model = make_recurrent(env=corridor(ACTIONS[0]), double=False, n_steps=20)
+    weight = model.policy.lstm_actor.weight_ih_l0
+    actors = Record(lambda model: model._actor, at="step")
+    model.learn(60, [actors, At(5, lambda model: setattr(weight, "data", weight.data.clone()))])
+    assert len(set(actors.records)) == 2 and type(actors.records[5]) is LstmActor
+
+
 @pytest.mark.parametrize("n_steps", [8, None])
 def test_a_run_does_not_depend_on_the_path(n_steps):
     ends = []

@@ -8,6 +8,8 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
+from gymnasium.wrappers import TimeLimit
+from models import make
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -18,6 +20,7 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
+from sb3_reinforce.sampling.collection import Extent
 
 CUTS = "ignore:Episodes that n_steps cuts"
 
@@ -307,3 +310,20 @@ def test_episode_starts_that_a_callback_writes(algorithm):
     assert models[1].rollout.dones[:, 0].nonzero().tolist() == [[5]]
     for ours, theirs in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.equal(ours, theirs)
+
+
+def test_a_later_episode_has_its_full_length_where_another_environment_has_finished():
+    extent = Extent.whole_episodes(3, 2, max_episode_steps=10)
+    extent.count(np.array([False, True]), 2)
+    extent.count(np.array([True, False]), 8)
+    for n_steps in range(9, 18):
+        extent.check_length(n_steps)
+    with pytest.raises(ValueError, match="An episode has not ended after max_episode_steps=10"):
+        extent.check_length(18)
+
+
+def test_the_mean_return_is_that_of_the_episodes_that_count():
+    """Short episodes that are played while a long one is waited for would be most of the window."""
+    env = DummyVecEnv([lambda: Monitor(TimeLimit(Corridor((9,)), 2)), lambda: Monitor(Corridor((9,)))])
+    model = make("episodes", env).learn(1)
+    assert sorted(info["l"] for info in model.ep_info_buffer) == [2, 9]
