@@ -299,4 +299,4 @@ def test_a_default_is_chosen_again_for_another_number_of_processes(tmp_path):
 def test_the_largest_seed_serves_all_processes(monkeypatch):
     """NumPy takes no larger one."""
     monkeypatch.setattr(distribution, "rank_and_size", lambda: (1, 2))
-    make("steps", Corridor(), seed=2**32 - 1).learn(8)
+    make("steps", Corridor(), seed=2**32 - 1)
