@@ -208,8 +208,7 @@ def restart_cart_pole(env: Any, ended: NDArray[np.bool_]) -> Any:
 def reset_copies(env: AsyncVectorEnv, wanted: list[int], seed: int | None = None, options: Any = None) -> list[Any]:
     """The observation and info of each of the ``wanted`` copies, reset in their processes by ``reset_mask``."""
     mask = np.isin(np.arange(env.num_envs), wanted)
-    seeds = [seed if is_wanted else None for is_wanted in mask]
-    obs, infos = env.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+    obs, infos = env.reset(seed=[seed] * env.num_envs, options={**(options or {}), "reset_mask": mask})
     return [(take(obs, i), info_of(infos, i)) for i in wanted]
 
 

@@ -62,8 +62,6 @@ def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any
     if not sampler.has_critic:
         # λ weights values, and there are none
         sampler.gae_lambda = 1.0
-    # A schedule that the copy renews is still to be renewed in the model
-    sampler._schedules = dict(model._schedules)
     sampler._processes = None
     sampler.set_logger(Logger(folder=None, output_formats=[]))
     sampler.ep_info_buffer = deque(maxlen=1)
