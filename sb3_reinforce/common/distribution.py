@@ -57,11 +57,11 @@ class Distributed(BaseAlgorithm):
     _processes: Processes | None = None
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed the generators and environments: ``seed`` plus the environment's index among all W·n."""
+        """Seed the generators and environments: ``seed`` plus the environment's index among all W·n, modulo 2³²."""
         rank, _ = rank_and_size()
         if rank > 0:
             # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions
-            seed = ((th.initial_seed() if seed is None else seed) + rank * self.n_envs) % 2**31
+            seed = ((th.initial_seed() % 2**31 if seed is None else seed) + rank * self.n_envs) % 2**32
         super().set_random_seed(seed)
 
     def check_same(self) -> None:

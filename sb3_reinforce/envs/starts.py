@@ -37,8 +37,8 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
 def start_groups(env: VecEnv, size: int) -> Any:
     """First observations; each group of ``size`` neighbouring environments shares a start."""
     seeds = th.randint(2**31, (env.num_envs // size,)).numpy().repeat(size)
-    # Pending seeds would replace these
-    env.reset()
+    # Pending seeds would replace these. VecNormalize need not know of this reset
+    env.unwrapped.reset()
     obs = start_episodes(env, seeds)
     check_groups(obs, size)
     return obs

@@ -17,7 +17,7 @@ class ParameterGroups:
     """
 
     def __init__(self) -> None:
-        self.sorted_for: tuple[int, ...] = ()
+        self.sorted_for: tuple[tuple[int, bool], ...] = ()
         self.of_actor: set[th.nn.Parameter] = set()
         self.of_critic: set[th.nn.Parameter] = set()
 
@@ -26,7 +26,7 @@ class ParameterGroups:
     ) -> tuple[Parameters, Parameters, Parameters]:
         """The trainable parameters of actor, critic alone and both, in the policy's order."""
         parameters = trainable(policy)
-        present = tuple(map(id, policy.parameters()))
+        present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
         if self.sorted_for != present:
             self.sorted_for, self.of_actor, self.of_critic = present, set(), set()
         if not self.of_actor | self.of_critic >= set(parameters):

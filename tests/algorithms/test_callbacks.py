@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At, Record
+from callbacks import Record
 from environments import Corridor
 from gymnasium import spaces
 from models import KINDS, all_kinds, make
@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 
@@ -173,11 +173,3 @@ def test_callbacks_of_sb3_stop_the_training(kind, stop):
         threshold = StopTrainingOnRewardThreshold(reward_threshold=4)
         callback = EvalCallback(eval_env, callback_on_new_best=threshold, eval_freq=12, verbose=0)
     assert make(kind, env).learn(1000, callback).num_timesteps == 24
-
-
-@all_kinds
-def test_a_vec_normalize_that_a_callback_stops_has_learned_its_last(kind):
-    """The search freezes them itself, and thaws those that were learning."""
-    env = VecNormalize(DummyVecEnv([Corridor]))
-    make(kind, env).learn(40, At(5, lambda model: setattr(env, "training", False)))
-    assert not env.training

@@ -152,11 +152,20 @@ class NoiseFromZero(gym.Env):
         return self.np_random.normal(size=1).astype(np.float32), 1.0, self.t == 2, False, {}
 
 
+def test_vec_normalize_counts_each_first_observation_once():
+    env = VecNormalize(DummyVecEnv([lambda: Scales(10.0)] * 4))
+    model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0, device="cpu")
+    counts = Record(lambda model: env.obs_rms.count, "rollout_start")
+    model.learn(12, counts)
+    # Of each rollout: four first observations, and four after the one step
+    assert np.diff(counts.records) == pytest.approx(8)
+
+
 def test_pending_seeds_are_used_up():
     """A callback seeds the environments, whose first observations say nothing about their seeds."""
     env = DummyVecEnv([NoiseFromZero] * 4)
     model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=2, seed=0)
-    second = Record(lambda model: model.rollout_buffer.observations[1])
+    second = Record(lambda model: model.rollout_buffer.observations[1].copy())
     model.learn(16, callback=[Record(lambda model: env.seed(3), "rollout_start"), second])
     assert len(second.records) == 2
     for rows in second.records:

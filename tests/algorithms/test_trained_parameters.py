@@ -231,13 +231,28 @@ def test_a_callback_finds_the_gradients_of_the_last_update():
     assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["steps"])
+def test_the_critic_trains_a_shared_extractor_that_was_frozen_at_first(kind):
+    ends = []
+    for vf_coef in (0.0, 0.25):
+        kwargs = {"features_extractor_class": Scaled, "net_arch": [4]}
+        model = make(kind, vf_coef=vf_coef, max_grad_norm=None, policy_kwargs=kwargs, seed=0)
+        scale = model.policy.features_extractor.scale.requires_grad_(False)
+        model.learn(8)
+        scale.requires_grad_()
+        model.learn(8, reset_num_timesteps=False)
+        ends.append(scale.grad)
+    assert not th.allclose(*ends)
+
+
 def test_each_pass_of_the_critic_draws_all_steps_in_a_new_order():
     model = make("steps", Corridor((40,)), n_steps=40, n_critic_updates=2, batch_size=8, seed=0)
     seen = []
     network = model.policy.mlp_extractor.value_net
     network.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].argmax(1)))
     model.learn(40)
-    first, second = th.cat(seen[-10:-5]).tolist(), th.cat(seen[-5:]).tolist()
+    minibatches = [steps for steps in seen if len(steps) == 8]
+    first, second = (th.cat(minibatches[i : i + 5]).tolist() for i in (0, 5))
     assert sorted(first) == sorted(second) == list(range(40))
     assert first != second and list(range(40)) not in (first, second)
 

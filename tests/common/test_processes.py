@@ -15,7 +15,6 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.common import distribution
 from sb3_reinforce.common.moments import seen_since
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
@@ -296,7 +295,13 @@ def test_a_default_is_chosen_again_for_another_number_of_processes(tmp_path):
     assert in_processes(2, load, tmp_path) == [24, 24]
 
 
-def test_the_largest_seed_serves_all_processes(monkeypatch):
-    """NumPy takes no larger one."""
-    monkeypatch.setattr(distribution, "rank_and_size", lambda: (1, 2))
-    make("steps", Corridor(), seed=2**32 - 1)
+@pytest.mark.parametrize(("seed", "expected"), [(5, 7), (2**31, 2**31 + 2), (2**32 - 1, 1)])
+def test_the_environments_of_the_second_process_have_the_following_seeds(seed, expected, monkeypatch):
+    """NumPy takes seeds up to 2³² − 1."""
+    for name, value in {"TORCHELASTIC_RUN_ID": "1", "RANK": "1", "WORLD_SIZE": "2"}.items():
+        monkeypatch.setenv(name, value)
+    env = make_vec_env(Corridor, 2)
+    monkeypatch.setattr(env, "seed", lambda seed=None: seeds.append(seed))
+    seeds = []
+    make("steps", env, seed=seed)
+    assert seeds == [expected]

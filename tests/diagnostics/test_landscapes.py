@@ -79,7 +79,7 @@ def test_the_estimators_take_the_perturbations_that_a_search_takes(perturbation,
 
 
 def test_the_steps_of_each_estimator_are_those_of_its_episodes():
-    """All of one step, in eight environments: U(θ), which the forward difference needs too, makes each take one."""
+    """Episodes have one step. U(θ) of the forward difference costs eight, one of each environment."""
     table = compare_estimators(bandit(), 8, 3, perturbation="sphere", n_delta=16, n_resamples=5)
     expected = {"likelihood_ratio": 1, "forward": 16 + 8, "central": 2 * 16, "regression": 16}
     assert {row.estimator: row.steps for row in table} == expected

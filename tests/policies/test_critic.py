@@ -14,7 +14,6 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.critic import minibatches
 from sb3_reinforce.policies.evaluation import evaluate, route_of
 from sb3_reinforce.policies.plain_mlp import plain_critic
 
@@ -169,4 +168,8 @@ def test_values_are_those_of_the_policy_that_a_callback_has_set():
 
 
 def test_minibatches_of_one_step_are_kept():
-    assert [len(each) for each in minibatches(make().policy, None, 3, 1)] == [1, 1, 1]
+    model = make(n_critic_updates=1, batch_size=1)
+    sizes = []
+    model.policy.value_net.register_forward_hook(lambda module, inputs, output: sizes.append(len(output)))
+    model.learn(1)
+    assert sizes.count(1) == N_STEPS * N_ENVS

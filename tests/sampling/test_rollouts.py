@@ -20,7 +20,6 @@ from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.recurrent import RecurrentREINFORCE
-from sb3_reinforce.sampling.collection import Extent
 
 CUTS = "ignore:Episodes that n_steps cuts"
 
@@ -313,13 +312,9 @@ def test_episode_starts_that_a_callback_writes(algorithm):
 
 
 def test_a_later_episode_has_its_full_length_where_another_environment_has_finished():
-    extent = Extent.whole_episodes(3, 2, max_episode_steps=10)
-    extent.count(np.array([False, True]), 2)
-    extent.count(np.array([True, False]), 8)
-    for n_steps in range(9, 18):
-        extent.check_length(n_steps)
-    with pytest.raises(ValueError, match="An episode has not ended after max_episode_steps=10"):
-        extent.check_length(18)
+    env = DummyVecEnv([lambda: Corridor((8,)), lambda: TimeLimit(Corridor((8,)), 2)])
+    model = make("episodes", env, n_episodes=3, max_episode_steps=8).learn(1)
+    assert model.rollout.dones.shape == (16, 2)
 
 
 def test_the_mean_return_is_that_of_the_episodes_that_count():
