@@ -57,10 +57,11 @@ class Distributed(BaseAlgorithm):
     _processes: Processes | None = None
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed the generators and environments: ``seed`` plus the environment's index among all W·n, modulo 2³²."""
+        """Seed the generators and environments: ``seed`` plus the environment's index among all W·n."""
         rank, _ = rank_and_size()
         if rank > 0:
             # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions
+            # Larger ones than 2³² − 1 are refused by NumPy
             seed = ((th.initial_seed() % 2**31 if seed is None else seed) + rank * self.n_envs) % 2**32
         super().set_random_seed(seed)
 
