@@ -84,9 +84,9 @@ def cost(policy):
     return -mean
 
 
-def cost_by_episodes(model, n_evaluations=4):
+def cost_by_episodes(model):
     """The cost after every 2,048 episodes of training, which have five steps each."""
-    return [cost(model.learn(2048 * 5, reset_num_timesteps=False)) for _ in range(n_evaluations)]
+    return [cost(model.learn(2048 * 5, reset_num_timesteps=False)) for _ in range(4)]
 
 
 alone = cost_by_episodes(make_model(1, seed))

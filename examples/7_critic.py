@@ -38,9 +38,9 @@ def norm_of_mean(gradients):
     return max(0.0, square.item()) ** 0.5
 
 
-def bias_and_noise(n_episodes=300):
+def bias_and_noise():
     """The bias of each λ, as a share of the gradient, and the standard deviation of a gradient of 16 episodes."""
-    rollout = sample(model, n_episodes)
+    rollout = sample(model, 300)
     rewards, dones, next_values = (part.numpy() for part in (rollout.rewards, rollout.dones, rollout.next_values))
     returns = [th.as_tensor(lambda_return(rewards, dones, next_values, model.gamma, lam)) for lam in lambdas]
     gradients = gradients_by_episode(rollout, *(each - rollout.values for each in returns))

@@ -29,12 +29,12 @@ generator = np.random.default_rng(seed)
 
 
 # %%
-def climb(rate, n_episodes, with_baseline, n_total=4000, n_runs=1000):
+def climb(rate, n_episodes, with_baseline):
     """The mean of π(Right) over the runs, before the first update and after each."""
-    theta, means = np.zeros((n_runs, 1)), []
-    for _ in range(n_total // n_episodes + 1):
+    theta, means = np.zeros((1000, 1)), []
+    for _ in range(4000 // n_episodes + 1):
         p = 1 / (1 + np.exp(-theta))
-        right = generator.random((n_runs, n_episodes)) < p
+        right = generator.random((1000, n_episodes)) < p
         returns = np.where(right, 12.0, 8.0)
         if with_baseline:
             returns = returns - (returns.sum(1, keepdims=True) - returns) / (n_episodes - 1)

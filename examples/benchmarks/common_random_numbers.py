@@ -21,15 +21,16 @@ from sb3_reinforce import FiniteDifference
 class Gradients(BaseCallback):
     """Collects ĝ of every update."""
 
-    def __init__(self) -> None:
+    def __init__(self, n_wanted: int) -> None:
         super().__init__()
+        self.n_wanted = n_wanted
         self.gradients: list[th.Tensor] = []
 
     def _on_rollout_end(self) -> None:
         self.gradients.append(self.locals["gradient"])
 
     def _on_step(self) -> bool:
-        return len(self.gradients) < self.model.n_wanted
+        return len(self.gradients) < self.n_wanted
 
 
 def main() -> None:
@@ -51,7 +52,7 @@ def main() -> None:
                 estimator=estimator, n_delta=arguments.n_delta, common_random_numbers=common, seed=arguments.seed,
                 device="cpu",
             )  # fmt: skip
-            model.n_wanted, callback = arguments.n_gradients, Gradients()
+            callback = Gradients(arguments.n_gradients)
             model.learn(10**9, callback, log_interval=None)
             variances[common] = float(th.stack(callback.gradients).var(0).sum())
             steps[common] = model.num_timesteps

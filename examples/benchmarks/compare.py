@@ -45,7 +45,8 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_reinforce import is_leader
 from sb3_reinforce.common.processes import Processes, rank_and_size
 from sb3_reinforce.zoo import ALGORITHMS as OURS
-from sb3_reinforce.zoo import HYPERPARAMS, Experiment
+from sb3_reinforce.zoo import HYPERPARAMS
+from sb3_reinforce.zoo.experiments import make_experiment
 
 ALGORITHMS = ("reinforce", "finite_difference", "a2c", "ppo", "trpo", "ars")
 SEARCHES = ("finite_difference", "ars")
@@ -83,7 +84,7 @@ def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
 def make(run: Run, params: dict[str, Any] | None = None) -> tuple[BaseAlgorithm, VecEnv, VecEnv]:
     """A model, its environments and evaluation environments, with a configuration that no other run shares."""
     with contextlib.redirect_stdout(io.StringIO()):
-        manager = (Experiment if run.algorithm in OURS else ExperimentManager)(
+        manager = make_experiment(
             argparse.Namespace(), run.algorithm, run.task, "", n_timesteps=run.budget, seed=run.seed, verbose=0,
             hyperparams=params,
         )  # fmt: skip
@@ -100,7 +101,7 @@ def make(run: Run, params: dict[str, Any] | None = None) -> tuple[BaseAlgorithm,
 
 
 def clocks() -> np.ndarray:
-    """The time of the day and the time of this process, in seconds."""
+    """The wall-clock time and the CPU time of this process, in seconds."""
     return np.array([time.perf_counter(), time.process_time()])
 
 

@@ -37,17 +37,16 @@ SIZES = (8, 16, 32, 64)
 class NoiseScaleEpisodes(GradientQualityCallback):
     """Sets ``n_episodes`` to the median of the last noise scales, and keeps the sizes of the rollouts."""
 
-    def __init__(self, least: int, most: int, window: int = 10):
-        super().__init__(every=1, baselines=(), max_episodes=most)
-        self.least, self.most = least, most
-        self.scales: deque[float] = deque(maxlen=window)
+    def __init__(self) -> None:
+        super().__init__(every=1, baselines=(), max_episodes=SIZES[-1])
+        self.scales: deque[float] = deque(maxlen=10)
         self.sizes: list[int] = []
 
     def measure(self, rollout: Rollout) -> dict[str, float]:
         self.sizes.append(self.model.n_episodes)
         figures = super().measure(rollout)
         self.scales.append(figures["noise_scale"])
-        scale = np.clip(np.median(self.scales), self.least, self.most)
+        scale = np.clip(np.median(self.scales), SIZES[0], SIZES[-1])
         # With unequal quotas some environments would wait for others
         self.model.n_episodes = self.model.n_envs * max(1, round(scale / self.model.n_envs))
         return figures
@@ -56,7 +55,7 @@ class NoiseScaleEpisodes(GradientQualityCallback):
 def train(run: Run, size: int | None) -> tuple[float, float]:
     """The final return with rollouts of ``size`` episodes, or with the callback, and the mean number of episodes."""
     model, env, eval_env = make(run, {"n_steps": None, "n_episodes": size or SIZES[1], "use_sde": False})
-    callback = NoiseScaleEpisodes(SIZES[0], SIZES[-1])
+    callback = NoiseScaleEpisodes()
     model.learn(run.budget, None if size else callback, log_interval=None)
     sync_envs_normalization(env, eval_env)
     mean, _ = evaluate_policy(model, eval_env, 100)

@@ -110,7 +110,6 @@ def messages() -> list[float]:
                 start = time.perf_counter()
                 processes.exchange(bytes(size))
                 seconds.append(time.perf_counter() - start)
-            # Process 0 sends back what it gets from both
             medians.append(float(np.median(seconds)))
     return medians
 

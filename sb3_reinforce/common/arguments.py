@@ -101,7 +101,7 @@ class CheckedSchedule(FloatSchedule):
     """
     A number ≥ 0, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    With ``above``, 0 is excluded until the end of training, or with ``may_reach`` only at its start.
+    With ``above`` a value may be 0 only at the end of training, or with ``may_reach`` anywhere after its start.
     """
 
     def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach: bool = False):

@@ -60,8 +60,8 @@ class Distributed(BaseAlgorithm):
         """Seed the generators and environments: ``seed`` plus the environment's index among all W·n."""
         rank, _ = rank_and_size()
         if rank > 0:
-            # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions
-            # Larger ones than 2³² − 1 are refused by NumPy
+            # Without a seed too: if the script seeds PyTorch, all processes would draw the same actions. NumPy refuses
+            # seeds above 2³² − 1
             seed = ((th.initial_seed() % 2**31 if seed is None else seed) + rank * self.n_envs) % 2**32
         super().set_random_seed(seed)
 
@@ -101,7 +101,7 @@ class Distributed(BaseAlgorithm):
         vars(self).update(state["attributes"])
         for own, total in zip(self._moments(), state["moments"], strict=True):
             vars(own).update(vars(total))
-        # All that a rollout adds to them is reported
+        # Without a limit, since all episodes of a rollout are sent
         self.ep_info_buffer = deque()
         self.ep_success_buffer = deque()
         cast(Processes, self._processes).state = state
@@ -164,7 +164,7 @@ class Distributed(BaseAlgorithm):
         seed = int(th.randint(2**31, ())) + processes.rank
         set_random_seed(seed)
         self.action_space.seed(seed)
-        # A list, with which log π is computed: the callbacks of process 0 may read it
+        # With None log π would not be computed, and the callbacks of process 0 may read it
         callback = self._init_callback([])
         try:
             self.adopt(*processes.receive())

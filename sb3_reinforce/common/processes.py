@@ -22,8 +22,9 @@ from sb3_reinforce.common.interruptions import uninterrupted
 
 # With the value 0, each process learns alone
 SWITCH = "SB3_REINFORCE_PROCESSES"
-# Within these times the cause of a signal arrives, and torchrun's SIGTERM after another process has ended
+# The cause of a signal arrives within this time
 CAUSE_SECONDS = 0.5
+# And so does torchrun's SIGTERM after another process has ended
 SIGTERM_SECONDS = 5.0
 
 
@@ -66,8 +67,9 @@ class Processes:
             dist.init_process_group("gloo", timeout=timedelta(days=365))
         self.rank, self.size = rank_and_size()
         self.lines: dict[Any, int] = {}
-        # Whether the others have yet to send their parts of a rollout, and the state that these started from
+        # Whether the others have yet to send their parts of a rollout
         self.in_round = False
+        # What these parts started from
         self.state: Any = None
         self.waited = 0.0
 

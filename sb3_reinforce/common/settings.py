@@ -226,7 +226,7 @@ def check_finite_difference(model: Any) -> None:
 def check_learn(env: Any, *arguments: Any) -> None:
     """Check the arguments of ``learn``, in their order."""
     if env is None:
-        raise ValueError("env is None, and learning needs an environment: give load one, or call set_env")
+        raise ValueError("env is None, and learning needs an environment: pass one to load, or call set_env")
     if th.get_default_device().type != "cpu":
         default = th.get_default_device()
         raise ValueError(f"PyTorch's default device must be the CPU, got {default}: give the model device=... instead")

@@ -79,7 +79,7 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
 
 
 def left_open(saved: Mapping[str, Any], given: Set[str], n_envs: int | None) -> dict[str, None]:
-    """Return, as None, defaults to choose again: arguments are given, or the environments or processes differ."""
+    """None for each default to choose again, if arguments are given or the environments or processes differ."""
     has_same_envs = n_envs in (None, saved.get("n_envs")) and rank_and_size()[1] == saved.get("_n_processes", 1)
     if not given and has_same_envs:
         return {}
@@ -152,12 +152,12 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
 def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: bool) -> bool:
     """Load the parameters of a policy, and return whether they were all there, and no others."""
     missing, others = policy.load_state_dict(state, strict=exact_match)
+    kind = type(policy).__name__
     if len(others) == len(state):
-        raise ValueError(f"load_path_or_dict['policy'] has no parameter of {type(policy).__name__}, got {others}")
+        raise ValueError(f"load_path_or_dict['policy'] has no parameter of {kind}, got {others}")
     if missing:
         warnings.warn(f"load_path_or_dict['policy'] has no {', '.join(missing)}: they stay as they are", stacklevel=3)
     if others:
-        kind = type(policy).__name__
         warnings.warn(f"{kind} has no {', '.join(others)} of load_path_or_dict['policy']: left out", stacklevel=3)
     return not (missing or others)
 
@@ -166,13 +166,13 @@ def load_optimizer(part: th.optim.Optimizer, name: str, state: Any, exact_match:
     """Load the state of an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
     reason = optimizer_mismatch(part, state)
     needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
-    if reason and exact_match:
-        raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
-    if reason:
-        warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
-    else:
+    if not reason:
         # Copies, or two models that one dict is given to would share their moments
         part.load_state_dict(deepcopy(dict(state)))
+    elif exact_match:
+        raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
+    else:
+        warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
 
 
 def generator_states(device: th.device) -> bytes:

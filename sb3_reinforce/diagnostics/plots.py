@@ -75,8 +75,7 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.set_xlim(left=0)
-    ax.set(xlabel=table.legend["ratio"])
-    ax.set_title(table.title.replace(" (", "\n("))
+    ax.set(xlabel=table.legend["ratio"], title=table.title.replace(" (", "\n("))
     bars = f"lines: {table.legend['[a, b]'].partition(';')[0]}s"
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False, title=bars)
     return ax
@@ -140,8 +139,7 @@ def plot_learning_curves(
         )
         (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
-    ax.set(xlabel="environment steps", ylabel="interquartile mean of the return")
-    ax.set_title("Learning curves")
+    ax.set(xlabel="environment steps", ylabel="interquartile mean of the return", title="Learning curves")
     ax.legend(title=f"bands: {confidence:.0%} bootstrap intervals")
     return ax
 
@@ -218,9 +216,9 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
         arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
         arrows.set(label=f"{name} ({len(x)})", edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
-    ax.set(xlabel="first direction, in units of ‖θ‖", ylabel="second direction, in units of ‖θ‖")
     points = f"{len(scape.scales)} × {len(scape.scales)} points of {scape.n_episodes} episodes"
-    ax.set_title(f"Utility on a plane through θ (the dot)\n{points}")
+    title = f"Utility on a plane through θ (the dot)\n{points}"
+    ax.set(xlabel="first direction, in units of ‖θ‖", ylabel="second direction, in units of ‖θ‖", title=title)
     if scape.steps:
         title = "directions of gradients (how many); their lengths mean nothing"
         legend = {"fontsize": "small", "frameon": False, "title": title, "title_fontsize": "small"}

@@ -36,7 +36,7 @@ def resample_counts(m: int, n_resamples: int, seed: int) -> th.Tensor:
     """How often each of m samples occurs in the sample itself (row 0) and in resamples, ``(1 + n_resamples, m)``."""
     size = (check_integer("n_resamples", n_resamples, 1), m)
     drawn = th.randint(m, size, generator=th.Generator().manual_seed(check_integer("seed", seed, 0)))
-    # A resample that repeats one sample m times has no pairs, so it gets a second one
+    # A resample of m copies of one sample has no pairs, so one copy is replaced
     drawn[:, 1] = th.where((drawn == drawn[:, :1]).all(1), (drawn[:, 0] + 1) % m, drawn[:, 1])
     counts = th.zeros(size, dtype=th.float64).scatter_add_(1, drawn, th.ones(drawn.shape, dtype=th.float64))
     return th.cat([th.ones(1, m, dtype=th.float64), counts])

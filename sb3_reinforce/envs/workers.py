@@ -38,7 +38,9 @@ class Pipe:
             # Closing needs no answer
             if is_last:
                 return
-            raise (self.death() if isinstance(error, ConnectionError) else error) from error
+            if isinstance(error, ConnectionError):
+                raise self.death() from error
+            raise
 
     def recv(self) -> Any:
         """The worker's answer, checked; None where nothing was asked, as by ``close`` after a broken step."""

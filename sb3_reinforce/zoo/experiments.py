@@ -103,8 +103,8 @@ class Experiment(exp_manager.ExperimentManager):
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:  # type: ignore[override]
         """Convert ``lin_NUMBER`` in every argument that may be a schedule; the algorithms take numbers themselves."""
-        # The Zoo converts two of them, to a class without which the saved model could not be loaded. No public method
-        # stands between the settings and the model
+        # The Zoo converts only two, to a class of the Zoo that loading the model would need. It has no public method to
+        # override
         converted = dict(hyperparams)
         for key in scheduled_keys(self.algo) & hyperparams.keys():
             if isinstance(hyperparams[key], str) and (start := LINEAR.fullmatch(hyperparams[key])):
@@ -114,7 +114,8 @@ class Experiment(exp_manager.ExperimentManager):
 
 def make_experiment(args: Any, algo: str, *others: Any, **kwargs: Any) -> exp_manager.ExperimentManager:
     """Make an ``Experiment`` for the algorithms of this package, and the Zoo's ``ExperimentManager`` for others."""
-    return (Experiment if algo in ALGORITHMS else exp_manager.ExperimentManager)(args, algo, *others, **kwargs)
+    manager = Experiment if algo in ALGORITHMS else exp_manager.ExperimentManager
+    return manager(args, algo, *others, **kwargs)
 
 
 def find_settings(experiment: Experiment) -> Settings:
