@@ -143,7 +143,7 @@ class RecurrentREINFORCE(REINFORCE):
             self._actor = None
 
     def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
-        """Reset also episodes whose states were not kept: after whole ones the user or a callback may set n_steps."""
+        """Reset also where no states were kept: the user or a callback may set n_steps after whole episodes."""
         if self._next_state is None and not np.all(self._last_episode_starts):
             self._last_obs = None
         super()._start_episodes(env, are_whole)

@@ -281,7 +281,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """What the actor trains, the critic alone and both; without a critic everything is the actor's."""
         if rollout.values is None:
             if self.step == "natural":
-                # A compiled network has gradients of 0 where there should be none
+                # A compiled network has gradients of 0 instead of None
                 return actor_parameters(self.policy, batch.observations, batch.actions), [], []
             return trainable(self.policy), [], []
         held = {parameter for group in self.critic_optimizer.param_groups for parameter in group["params"]}
@@ -340,7 +340,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         baseline = check_function("baseline", self.baseline, BASELINES)
         route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
-        is_whole = False
+        is_collected = False
         self.is_collecting = True
         try:
             collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
@@ -353,14 +353,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
                 self.rollout = self._complete(rollout_buffer, columns, route, baseline, n_rollout_steps is not None)
-            is_whole = True
+            is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
             check_rollout_data(rollout_buffer, self._last_obs, {})
             raise
         finally:
             self.is_collecting = False
-            if not is_whole or has_given_seeds(env):
+            if not is_collected or has_given_seeds(env):
                 # The environments stopped in the middle of episodes, or may draw the same random numbers: they are
                 # reset before they are used again
                 self._last_obs = None
@@ -442,7 +442,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
-        # The natural step bounds the policy's change, which the critic's error would be no part of
+        # The natural step bounds the policy's change, and the critic's error has no part in that
         with_values = bool(shared) and self.step == "optimizer"
         log_prob, entropy, values = evaluate(
             self.policy, route, batch.observations, batch.actions, with_values=with_values

@@ -84,6 +84,7 @@ def draw_curves(results: pd.DataFrame) -> None:
             values = np.concatenate([line.get_ydata() for line in axis.get_lines()])
             margin = 0.05 * np.ptp(values)
             axis.set_ylim(values.min() - margin, values.max() + margin)
+            axis.title.set_fontsize("medium")
     for axis in pairs[len(tasks) :].flat:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task

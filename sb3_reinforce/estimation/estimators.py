@@ -136,8 +136,8 @@ class Fit:
 
     :param r_squared: Share of their variance within columns that ``u₀ + δ · ĝ`` explains; NaN where there is none
     :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
-    :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None where the
-        evaluations do not determine every component and leave a degree of freedom. It is too small for forward
+    :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None unless the
+        evaluations determine every component and leave a degree of freedom. It is too small for forward
         differences, which share the noise of U(θ), and without a meaning for ``n_top``, where ĝ is another fit
     """
 

@@ -92,7 +92,7 @@ def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, 
     return delta_std * check_tensor("perturbation", perturbation(k, n, generator), (k, n))
 
 
-# More perturbations cost more than rough gradients and more updates do
+# Beyond this, more updates with rougher gradients cost less
 MAX_DEFAULT_N_DELTA = 64
 # The utility of a policy near zero does not tell smaller perturbations from none
 MIN_DEFAULT_DELTA_STD = 0.05
@@ -108,8 +108,9 @@ def default_n_delta(n_parameters: int, estimator: object, perturbation: object) 
     """
     if perturbation in ("coordinate", coordinate) and estimator != "regression":
         return min(n_parameters, MAX_DEFAULT_N_DELTA)
-    k = min(2 * n_parameters, MAX_DEFAULT_N_DELTA)
-    return k if k >= 1.5 * n_parameters else min(n_parameters // 2, MAX_DEFAULT_N_DELTA)
+    if 1.5 * n_parameters <= MAX_DEFAULT_N_DELTA:
+        return min(2 * n_parameters, MAX_DEFAULT_N_DELTA)
+    return min(n_parameters // 2, MAX_DEFAULT_N_DELTA)
 
 
 def default_delta_std(theta: th.Tensor) -> float:

@@ -75,8 +75,8 @@ class Rollout:
         The number of the start, or 0 for all where each episode has a start to itself.
         """
         n_steps, n_envs = self.dones.shape
-        numbers = th.arange(n_envs) // (n_envs if self.episodes_per_start == 1 else self.episodes_per_start)
-        return numbers.expand(n_steps, n_envs)
+        size = n_envs if self.episodes_per_start == 1 else self.episodes_per_start
+        return (th.arange(n_envs) // size).expand(n_steps, n_envs)
 
     @property
     def inputs(self) -> Any:
@@ -107,7 +107,7 @@ class Running:
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
     def unless(self, starts: Bools) -> "Running":
-        """The episodes that go on where none ``starts``; environments that were not there before must start."""
+        """These episodes, and new ones where ``starts``, which must be True for added environments."""
         timesteps = np.resize(self.timesteps, len(starts))
         rewards = np.resize(self.rewards, len(starts))
         return Running(np.where(starts, 0, timesteps), np.where(starts, 0.0, rewards))

@@ -23,7 +23,7 @@ from sb3_reinforce.estimation.rollout import (
     within_quota,
 )
 
-# Differences between returns of less than this part of them are rounding errors
+# Differences up to this fraction of the numbers are rounding errors
 ROUNDING = 1e-12
 
 

@@ -109,10 +109,11 @@ def minibatches(policy: ActorCriticPolicy, obs: Any, n: int, size: int) -> Itera
         return [slice(None)]
     if isinstance(policy, RecurrentPolicy):
         return sequence_minibatches(obs["sequence"], size)
-    batches = th.randperm(n).to(policy.device).split(size)  # type: ignore[no-untyped-call]
+    batches = list(th.randperm(n).to(policy.device).split(size))  # type: ignore[no-untyped-call]
     # BatchNorm takes no batch of one step
-    is_single = len(batches[-1]) == 1 < size
-    return [*batches[:-2], th.cat(batches[-2:])] if is_single else batches
+    if size > 1 and len(batches[-1]) == 1:
+        return [*batches[:-2], th.cat(batches[-2:])]
+    return batches
 
 
 def value_of_batch(

@@ -66,7 +66,7 @@ def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
     if actor is not None:
         return Route(with_critic, actor, critic)
     own_parts = overrides(policy, "predict_values", "get_distribution")
-    shares = policy.share_features_extractor and any(True for _ in policy.features_extractor.parameters())
+    shares = policy.share_features_extractor and bool(list(policy.features_extractor.parameters()))
     at_once = with_critic and shares and not own_parts
     return Route(
         with_critic,
@@ -195,7 +195,7 @@ def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Te
 
 def reached_by(compute: Callable[[], th.Tensor], parameters: Parameters) -> Parameters:
     """The parameters that an output depends on."""
-    # A compiled network has gradients of 0 where there should be none
+    # A compiled network has gradients of 0 instead of None
     with th.compiler.set_stance("force_eager"):
         output = compute()
         if not output.requires_grad:

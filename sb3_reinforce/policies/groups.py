@@ -35,7 +35,7 @@ class ParameterGroups:
             self.of_critic.update(critic_parameters(policy, obs, actions))
             if policy.share_features_extractor:
                 self.of_actor.update(policy.features_extractor.parameters())
-        # The scale of a layer's noise may act in training mode only; a step without a gradient leaves it alone
+        # Such as the scale of a layer's noise in training mode; a step without a gradient leaves it alone
         others = set(parameters) - self.of_actor - self.of_critic
         groups = self.of_actor | others, self.of_critic - self.of_actor | others, self.of_critic & self.of_actor
         actor, critic, shared = ([p for p in parameters if p in group] for group in groups)

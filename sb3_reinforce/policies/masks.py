@@ -83,7 +83,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
         except ValueError:
             # Lists of different lengths
             numbers = np.empty(0)
-        # What is added to logits elsewhere would be read the other way round
+        # A mask that is added to logits (0 = allowed) would be read the other way round
         if len(numbers) != self._n_actions or not np.isin(numbers, (0, 1)).all():
             raise ValueError(
                 f"action_masks() must return {self._n_actions} booleans in a row for {self.action_space}, got {masks!r}"

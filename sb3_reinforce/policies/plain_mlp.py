@@ -88,7 +88,7 @@ def overrides(policy: ActorCriticPolicy, *methods: str) -> bool:
 
 
 def is_unchanged(thing: Any) -> bool:
-    """Whether neither a method is replaced on an instance nor a hook registered, except for the temperature."""
+    """Whether an instance has no replaced method, and no hook but the temperature's."""
     cls: Any = type(thing)
     hooks = hooks_of(thing) if isinstance(thing, nn.Module) else []
     return methods_of(cls).isdisjoint(vars(thing)) and all(isinstance(hook, DivideLogits) for hook in hooks)

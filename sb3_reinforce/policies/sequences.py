@@ -77,7 +77,7 @@ class RecurrentPolicy(ActorCriticPolicy):
         return extractor
 
     def set_training_mode(self, mode: bool) -> None:
-        """Set the mode of all parts but of memories without dropout: cuDNN has no backward pass in evaluation mode."""
+        """Set the mode; memories without dropout stay in training mode, since cuDNN has no other backward pass."""
         super().set_training_mode(mode)
         for memory in (self.lstm_actor, self.lstm_critic):
             if memory is not None:
@@ -140,7 +140,7 @@ class RecurrentPolicy(ActorCriticPolicy):
         return self.remember(self.lstm_actor, self.row_features(rows, self.pi_features_extractor), rows, critic=False)
 
     def row_features(self, rows: Rows, extractor: nn.Module) -> th.Tensor:
-        """The features of n rows, without padding, unless the rows have them already."""
+        """The features of n rows, without padding; the rows may hold them already."""
         if "features" in rows:
             return cast(th.Tensor, rows["features"])
         return BasePolicy.extract_features(self, rows["observations"], extractor)  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from sb3_reinforce.common.spaces import env_actions_of, shift_to_start
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import distribution_of, extract_features
+from sb3_reinforce.policies.masks import sizes_of
 from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
 # Where the distribution of gSDE keeps its noise
@@ -88,8 +89,7 @@ class MatrixActor:
             return values.mT.repeat(n_envs, 1, 1).mT if values.dim() == 2 else values.repeat(n_envs, 1)
 
         # Frozen parameters too, with the same values in all environments
-        values = [parameter for layer in layers for parameter in layer.parameters()]
-        stacks: dict[th.Tensor, th.Tensor] = {parameter: stacked(parameter) for parameter in values}
+        stacks: dict[th.Tensor, th.Tensor] = {each: stacked(each) for layer in layers for each in layer.parameters()}
         self.stacks = [stacks[parameter] for parameter in searched]
         self.operations = [
             (stacks[layer.weight].mT, stacks[layer.bias][:, None]) if isinstance(layer, th.nn.Linear) else layer
@@ -141,6 +141,6 @@ def mode(outputs: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
     if isinstance(space, spaces.Discrete):
         return outputs.argmax(1)
     if isinstance(space, spaces.MultiDiscrete):
-        parts = th.split(outputs, [int(n) for n in space.nvec.flat], dim=1)
+        parts = th.split(outputs, sizes_of(space), dim=1)
         return th.stack([part.argmax(1) for part in parts], dim=1)
     return (outputs > 0).to(outputs.dtype) if isinstance(space, spaces.MultiBinary) else outputs

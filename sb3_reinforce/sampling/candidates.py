@@ -2,8 +2,8 @@
 Many parameter vectors evaluated side by side in one VecEnv.
 
 The queue of (candidate, episode) pairs is fixed before the first step, or short episodes would be sampled more often.
-With seeds it is worked off in rounds, whose pairs start together from the seeds of their episodes: a VecEnv resets an
-environment without a seed. Without seeds an environment whose episode ends takes the next pair.
+With seeds it is worked off in rounds, whose pairs start together from the seeds of their episodes: a VecEnv's resets at
+the end of episodes have no seed. Without seeds an environment whose episode ends takes the next pair.
 """
 
 import math
@@ -87,7 +87,7 @@ def seeds_of(shape: Sequence[int], n_episodes: int, first_seed: int) -> np.ndarr
     """
     Seeds of the episodes of candidates of a shape ``(k, n)`` or ``(m, k, n)``, a row of ``n_episodes`` for each.
 
-    Candidates ``(k, n)`` all have the same seeds; of ``(m, k, n)`` the m of a column have, as θ + δ and θ − δ.
+    Candidates ``(k, n)`` all share seeds; of ``(m, k, n)`` the m of a column do, such as θ + δ and θ − δ.
     """
     return (first_seed + columns_of(shape)[:, None] * n_episodes + np.arange(n_episodes)) % 2**31
 

@@ -188,7 +188,7 @@ def write_row(rows: Any, step: int, values: Any) -> None:
 
 
 def write_log_probs(buffer: RolloutBuffer, actor: Actor, first_row: int) -> None:
-    """Write log π of the rows from ``first_row`` on, which other actors return with the actions."""
+    """Write log π from ``first_row`` on, which a NumpyActor does not return with the actions."""
     if first_row < buffer.pos and isinstance(actor, NumpyActor):
         rows = slice(first_row, buffer.pos)
         buffer.log_probs[rows] = actor.log_prob(buffer.actions[rows]).reshape(-1, buffer.n_envs)
