@@ -30,6 +30,11 @@ def final(*names: str) -> pd.DataFrame:
     return rows[rows["evaluation"] == "final"]
 
 
+def compared() -> pd.DataFrame:
+    """The final evaluations of REINFORCE and its peers."""
+    return final("comparison", "comparison_others", "comparison_short")
+
+
 def beside_peers(task: str, budget: int, runs: pd.DataFrame) -> list[str]:
     """The final returns of REINFORCE and its peers, with the task and the number of steps."""
     returns = [runs.loc[runs["algorithm"] == name, "return"] for name in ("reinforce", *PEERS)]
@@ -39,7 +44,7 @@ def beside_peers(task: str, budget: int, runs: pd.DataFrame) -> list[str]:
 def comparison() -> str:
     """REINFORCE and its peers on every task that REINFORCE was run on."""
     lines = []
-    for task, budget, runs in by_task(final("comparison", "comparison_others")):
+    for task, budget, runs in by_task(compared()):
         if "reinforce" in set(runs["algorithm"]):
             lines.append([*beside_peers(task, budget, runs), published(task, *PEERS)])
     header = ["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO", "published [steps]"]
@@ -48,7 +53,7 @@ def comparison() -> str:
 
 def natural() -> str:
     """The natural step beside the optimizer's step, and TRPO with as many steps."""
-    trpo = final("comparison", "comparison_others").query("algorithm == 'trpo'").groupby(["task", "budget"])
+    trpo = compared().query("algorithm == 'trpo'").groupby(["task", "budget"])
     lines = []
     for task, budget, runs in by_task(read("natural")):
         cells = [counted(runs[runs["step"] == step]["return"]) for step in ("natural", "optimizer")]
@@ -67,7 +72,7 @@ def seconds() -> str:
 
 def readme() -> str:
     """The README's small table."""
-    rows = final("comparison", "comparison_others").groupby(["task", "budget"])
+    rows = compared().groupby(["task", "budget"])
     lines = [beside_peers(task, budget, rows.get_group((task, budget))) for task, budget in README_TASKS.items()]
     return markdown(["task (steps)", "REINFORCE [seeds]", "A2C", "PPO", "TRPO"], lines)
 

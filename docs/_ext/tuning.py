@@ -4,7 +4,7 @@ import inspect
 
 import yaml
 from cells import RESULTS, counted, markdown, number, read, short, spread
-from tables import final
+from tables import compared
 
 from sb3_reinforce import REINFORCE
 
@@ -30,7 +30,7 @@ def is_shipped(task: str, text: str) -> bool:
 def chosen_on() -> str:
     """The ten seeds of the choice beside the reported ones, with the shipped settings; a seed's later run counts."""
     rows = read("tuning").query("algorithm == 'reinforce' and 100 <= seed < 110")
-    reported = final("comparison", "comparison_others").query("algorithm == 'reinforce'").groupby(["task", "budget"])
+    reported = compared().query("algorithm == 'reinforce'").groupby(["task", "budget"])
     lines = []
     for (task, budget, text), same in rows.groupby(["task", "budget", "settings"]):
         returns = same.groupby("seed")["return"].last()
