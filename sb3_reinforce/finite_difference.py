@@ -282,7 +282,7 @@ class FiniteDifference(BasePolicyGradient):
         ``learn`` calls it. If you call it yourself, seed the environments again afterwards (``env.seed``): with common
         random numbers all have the seed of the last candidates.
 
-        :param callback: Called at each step, and at the beginning and end of the rollout, after ``init_callback``
+        :param callback: Called at each step and at both ends of the rollout; call its ``init_callback`` first
         :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them
         :raises ValueError: As ``learn``, or if ``learn`` was never called
         """

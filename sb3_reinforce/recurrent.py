@@ -55,10 +55,10 @@ class RecurrentREINFORCE(REINFORCE):
 
     :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy, MaskedLstmPolicy or a subclass of one of them
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
-    :param learning_rate: Of the policy, and of the critic unless ``critic_learning_rate`` is given; a schedule too
+    :param learning_rate: Rate or schedule of the policy, and of the critic without a ``critic_learning_rate``
     :param n_steps: Steps per environment and rollout, instead of ``n_episodes``
-    :param n_episodes: Whole episodes per rollout; if ``n_steps`` is None too, 16, or one of each environment if there
-        are more
+    :param n_episodes: Whole episodes per rollout; if ``n_steps`` is None too, 16, or the number of environments if
+        larger
     :param batch_size: Steps per minibatch of the critic, at least one whole sequence
     :param kwargs: All other arguments of :class:`~sb3_reinforce.REINFORCE`
     :raises TypeError: If an argument is of the wrong type

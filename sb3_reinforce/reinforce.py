@@ -130,8 +130,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
         (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of
         a thousand steps or more. Policies whose log π differs in training mode, as with dropout, are refused
-    :param target_kl: With ``step="natural"``, the mean of KL(π_before ‖ π_after) over the states of the rollout (at
-        most 1.2 times it), before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
+    :param target_kl: With ``step="natural"``, the target of the rollout's mean KL(π_before ‖ π_after), which is at most
+        1.2 times it, before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation; the dictionary is not modified
@@ -269,7 +269,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._apply_temperature_and_floor()
 
     def _make_critic_optimizer(self) -> None:
-        """An optimizer over all parameters, which only gets the gradients of the critic's."""
+        """An optimizer over all parameters, of which only the critic's get gradients."""
         self.critic_optimizer = self.policy.optimizer_class(
             self.policy.parameters(),
             lr=self._critic_rate(),  # type: ignore[call-arg]
@@ -278,7 +278,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         optimization.fuse(self.critic_optimizer)
 
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
-        """What the actor trains, the critic alone and both; without a critic everything is the actor's."""
+        """Parameters of the actor, of the critic alone and of both; without a critic the last two are empty."""
         if rollout.values is None:
             if self.step == "natural":
                 # A compiled network has gradients of 0 instead of None
@@ -428,8 +428,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         One policy step along ĝ, then the critic's passes.
 
-        :raises ValueError: If a gradient is not finite, or a step makes a parameter that is not; the parameters are
-            those before that step, or before the critic's passes; or if there is no rollout
+        :raises ValueError: If there is no rollout, a gradient is not finite, or a step makes a parameter that is not;
+            the parameters are then those before that step, or before the critic's passes
         """
         rollout = self.rollout
         if rollout is None:
@@ -462,7 +462,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.policy.set_training_mode(False)
             grad_norm, kl = self._step_policy(route, batch, actor, gradients, log_prob.detach())
             self.policy.set_training_mode(True)
-        # A model that is saved now will be loaded with the temperature of the progress made
+        # load applies the temperature of this progress, and a model that is saved now must act like it
         self._apply_temperature_and_floor()
         self._n_updates += 1
 
@@ -490,7 +490,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             check_distribution(self.policy, obs, actions, log_prob)
             return natural_step(self.policy, obs, actor, gradients, target_kl)
         if route.actor is None:
-            # Passes over images or sequences take long, and those in training mode cannot be repeated
+            # Passes over images take long, and log π in training mode may differ, as with dropout
             obs, actions = some_steps(self.policy, obs, actions)
             log_prob = acting_log_prob(self.policy, route, obs, actions)
         with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
@@ -502,7 +502,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     ) -> None:
         """The critic's passes over the rollout; ``values`` are V(s_t) before them."""
         if is_shared:
-            # Passes that moved statistics of what the actor uses too would be a second step of the policy
+            # Passes in training mode would move shared batch statistics, a second step of the policy
             self.policy.set_training_mode(False)
         if self.policy.share_features_extractor:
             self.policy.features_extractor.eval()

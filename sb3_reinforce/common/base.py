@@ -41,7 +41,7 @@ class BasePolicyGradient(Distributed):
     _random_state: bytes
 
     def __new__(cls: type[Model], *args: Any, **kwargs: Any) -> Model:
-        # Where Python would only say that an argument is unexpected; a subclass may have it
+        # Python would only say that the argument is unexpected; a subclass may have it
         accepted = own_arguments(cls, BasePolicyGradient)
         for name, instead in cls._instead.items():
             if name in kwargs and name not in accepted:
@@ -239,7 +239,7 @@ class BasePolicyGradient(Distributed):
         storage.check_finite_state(own, storage.may_be_infinite(self.policy))
         before: Any = deepcopy(self.get_parameters())
         try:
-            # First the policy, whose mismatch is named by its parameters. The optimizers' states belong to all of these
+            # First the policy, whose error names parameters. The optimizers' states fit only if all of these are loaded
             if "policy" not in own or storage.load_policy(self.policy, own.pop("policy"), exact_match):
                 for name, state in own.items():
                     storage.load_optimizer(recursive_getattr(self, name), name, state, exact_match)

@@ -23,7 +23,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 # The arguments that may differ between processes
 OWN_ARGUMENTS = {"verbose", "device", "tensorboard_log"}
-# The attributes of process 0 that all take over before they collect; a ``_last_obs`` of None lets all reset too
+# All take over process 0's attributes of these types before they collect; with a ``_last_obs`` of None all reset
 SHARED = (bool, int, float, np.number, str, type(None), th.Generator)
 
 

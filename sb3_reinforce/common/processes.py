@@ -24,7 +24,7 @@ from sb3_reinforce.common.interruptions import uninterrupted
 SWITCH = "SB3_REINFORCE_PROCESSES"
 # The cause of a signal arrives within this time
 CAUSE_SECONDS = 0.5
-# And so does torchrun's SIGTERM after another process has ended
+# torchrun's SIGTERM arrives within this time after a process has ended
 SIGTERM_SECONDS = 5.0
 
 
@@ -166,14 +166,14 @@ class Processes:
                 line.close()
 
     def fail(self, error: BaseException) -> None:
-        """Send an error to the others; if the end of another process has led to it, send and raise this one instead."""
-        # BadData, which is one, is internal
+        """Send an error to the others, or send and raise the error of another process whose end has caused this one."""
+        # BadData is an internal ValueError
         name = "ValueError" if isinstance(error, ValueError) else type(error).__name__
         reason = f"{name}: {error}".removesuffix(": ")
         message = ProcessError(f"Process {self.rank} of {self.size} has stopped: {reason}")
         message.is_interrupt = isinstance(error, KeyboardInterrupt)
         if message.is_interrupt:
-            # torchrun sends SIGTERM where another process has ended; it may also have been interrupted as this one
+            # torchrun sends SIGTERM after another process has ended, by an error or interrupted like this one
             try:
                 self.receive(CAUSE_SECONDS)
             except Exception as cause:

@@ -186,7 +186,7 @@ def check_reinforce(model: Any) -> None:
 
 
 def check_named(name: str, value: Any, functions: Mapping[str, Callable[..., Any]]) -> Any:
-    """Return the user's own function, or the name of one of ours, which has the limits of its name."""
+    """Return the user's own function, or the name of one of ours, by which other arguments are checked."""
     function = check_function(name, value, functions)
     return next((each for each, known in functions.items() if known is function), function)
 
@@ -227,8 +227,8 @@ def check_learn(env: Any, *arguments: Any) -> None:
     """Check the arguments of ``learn``, in their order."""
     if env is None:
         raise ValueError("env is None, and learning needs an environment: pass one to load, or call set_env")
-    if th.get_default_device().type != "cpu":
-        default = th.get_default_device()
+    default = th.get_default_device()
+    if default.type != "cpu":
         raise ValueError(f"PyTorch's default device must be the CPU, got {default}: give the model device=... instead")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

@@ -68,7 +68,7 @@ def step_bound(history: History) -> tuple[str, float]:
 def rate_too_large(history: History) -> str | None:
     """
     A KL divergence above 1 in one update, a median above 0.1 over ten, or a loss of more than half of the randomness
-    within ten, which a falling temperature may explain.
+    within ten, unless the temperature has fallen.
     """
     updates = history.updates[-10:]
     steps = [update.kl for update in updates if not math.isnan(update.kl)]
@@ -110,8 +110,8 @@ def unscaled_returns(history: History) -> str | None:
 
 def too_few_episodes(history: History) -> str | None:
     """
-    A signal-to-noise ratio of the gradients of 50 updates below 0.1. Each has fewer than 8 whole episodes or, in fixed
-    rollouts, 64 steps.
+    A signal-to-noise ratio below 0.1 of the gradients of 50 updates with, on average, fewer than 8 whole episodes or,
+    in fixed rollouts, 64 steps.
 
     The ratio alone would not do: it is near 0 for a policy that has nothing left to learn, however large its batches.
     """
@@ -149,11 +149,13 @@ def spikes_without_clipping(history: History) -> str | None:
     """A gradient ten times as long as usual, without a bound on its norm: the natural step does not depend on it."""
     norms = [update.grad_norm for update in history.updates]
     is_unbounded = history.model.step == "optimizer" and history.model.max_grad_norm in (None, math.inf)
-    if is_unbounded and len(norms) >= 20 and norms[-1] > 10 * median(norms[:-1]) > 0:
-        return (
-            f"A gradient has norm {norms[-1]:.3g}, and the median is {median(norms[:-1]):.3g}: one such batch can undo "
-            "what was learned. Set max_grad_norm, 0.5 for example"
-        )
+    if is_unbounded and len(norms) >= 20:
+        usual = median(norms[:-1])
+        if norms[-1] > 10 * usual > 0:
+            return (
+                f"A gradient has norm {norms[-1]:.3g}, and the median is {usual:.3g}: one such batch can undo what was "
+                "learned. Set max_grad_norm, 0.5 for example"
+            )
     return None
 
 

@@ -20,9 +20,9 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
-# Random directions in which scores are compared with differences, and observations at which a sign is checked
+# Random directions of the finite differences, and observations at which signs and samples are checked
 N_DIRECTIONS = 16
-N_ACTIONS = 8
+N_OBSERVATIONS = 8
 
 
 def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
@@ -161,7 +161,7 @@ def sign_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> float:
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     wrong = []
-    for index in th.randperm(n_obs)[:N_ACTIONS]:
+    for index in th.randperm(n_obs)[:N_OBSERVATIONS]:
         one = take(obs, index[None])
         draws = draw(policy, one, n_draws)
         # The effect of a step is clearest for the action that is farthest from the rest
@@ -183,7 +183,7 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     errors = []
-    for index in th.randperm(n_obs)[:N_ACTIONS]:
+    for index in th.randperm(n_obs)[:N_OBSERVATIONS]:
         one = take(obs, index[None])
         many = take(one, th.zeros(n_draws, dtype=th.long))
         many = without_memory(many) if isinstance(policy, RecurrentPolicy) else many

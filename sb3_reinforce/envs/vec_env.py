@@ -70,7 +70,7 @@ class GymnasiumVecEnv(VecEnv):
         """Make the step; malformed observations and rewards are refused."""
         obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
         rewards = np.asarray(rewards)
-        # As a mask, zeros and ones would be the numbers of copies
+        # Integers would not mask, but index the copies 0 and 1
         terminated = np.asarray(terminated, dtype=bool)
         truncated = np.asarray(truncated, dtype=bool)
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":

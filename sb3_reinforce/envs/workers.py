@@ -58,7 +58,7 @@ class Pipe:
                 answer = obs, as_reward(reward, self.env), done, info, reset_info
             return answer
         except BaseException:
-            # The others' answers are left to the next question, not to ``close``
+            # Otherwise ``close`` would wait for the others' answers
             self.workers.waiting = False
             raise
 

@@ -151,11 +151,13 @@ def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     if layers is None:
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    is_shared = len({id(parameter) for parameter in parameters}) < len(parameters)
-    own_std = isinstance(policy.action_dist, DiagGaussianDistribution) and not (
-        isinstance(policy.log_std, nn.Parameter) and policy.log_std.dim() == 1
-    )
-    return None if is_shared or own_std else layers
+    if len({id(parameter) for parameter in parameters}) < len(parameters):
+        return None
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        log_std = policy.log_std
+        if not isinstance(log_std, nn.Parameter) or log_std.dim() != 1:
+            return None
+    return layers
 
 
 def score_factors(

@@ -137,7 +137,7 @@ def evaluate(
 
 
 def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-    """log π(a|s), shape ``(n,)``; the critic is evaluated only if a user's ``evaluate_actions`` does it."""
+    """log π(a|s), shape ``(n,)``; the critic is evaluated only if the route calls ``evaluate_actions``."""
     return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
 
 
@@ -213,7 +213,7 @@ def temperature_of(policy: ActorCriticPolicy) -> float:
 
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     """
-    Let the policy act and be evaluated at temperature τ, from 1e-3 on: a schedule may fall to 0.
+    Let the policy act and be evaluated at temperature max(τ, 1e-3): a schedule may fall to 0.
 
     ``policy.save`` does not keep it, ``model.save`` does.
     """

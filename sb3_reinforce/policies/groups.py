@@ -28,7 +28,9 @@ class ParameterGroups:
         parameters = trainable(policy)
         present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
         if self.sorted_for != present:
-            self.sorted_for, self.of_actor, self.of_critic = present, set(), set()
+            self.sorted_for = present
+            self.of_actor = set()
+            self.of_critic = set()
         if not self.of_actor | self.of_critic >= set(parameters):
             policy.set_training_mode(False)
             self.of_actor.update(actor_parameters(policy, obs, actions))
@@ -37,6 +39,8 @@ class ParameterGroups:
                 self.of_actor.update(policy.features_extractor.parameters())
         # Such as the scale of a layer's noise in training mode; a step without a gradient leaves it alone
         others = set(parameters) - self.of_actor - self.of_critic
-        groups = self.of_actor | others, self.of_critic - self.of_actor | others, self.of_critic & self.of_actor
-        actor, critic, shared = ([p for p in parameters if p in group] for group in groups)
+        only_critic = self.of_critic - self.of_actor
+        actor = [each for each in parameters if each in self.of_actor | others]
+        critic = [each for each in parameters if each in only_critic | others]
+        shared = [each for each in parameters if each in self.of_actor & self.of_critic]
         return actor, critic, shared

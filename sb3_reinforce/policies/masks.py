@@ -1,7 +1,7 @@
 """
 Action masks as part of the observation: no algorithm, callback or VecEnv has to know of them.
 
-The mask stands behind the features, passes the layers of the actor by, and meets the logits at the end.
+The mask stands behind the features, bypasses the layers of the actor, and meets the logits at the end.
 """
 
 from typing import Any, TypeVar

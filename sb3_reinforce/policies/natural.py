@@ -76,7 +76,8 @@ def natural_step(
             "policy by target_kl. Mostly the policy is almost deterministic; ent_coef, temperature or min_std may help",
             stacklevel=2,
         )
-    return norm, kl or 0.0
+        return norm, 0.0
+    return norm, kl
 
 
 @th.no_grad()
@@ -117,7 +118,7 @@ def hessian_vector_product(output: th.Tensor, parameters: Parameters) -> Callabl
 
 
 def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor) -> th.Tensor:
-    """x with ``A x ≈ b`` for a positive definite A (Hestenes and Stiefel, 1952), or 0 if A is found to be none."""
+    """x with ``A x ≈ b`` for a positive definite A (Hestenes and Stiefel, 1952), or 0 if A is found not to be."""
     x = th.zeros_like(b)
     residual = b
     direction = b

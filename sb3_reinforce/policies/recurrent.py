@@ -72,7 +72,7 @@ class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy
 
 
 class BesideMask(th.nn.Module):
-    """A layer that the mask behind its inputs passes by."""
+    """A layer that the mask behind its inputs bypasses."""
 
     def __init__(self, layer: th.nn.Module, n_actions: int):
         super().__init__()

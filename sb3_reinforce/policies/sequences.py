@@ -2,8 +2,8 @@
 Recurrent policies on whole sequences: one sequence is one episode, or its part within a fixed rollout.
 
 Such a policy is evaluated on rows: the observation, the number of the sequence that the row belongs to, and the state
-from which that sequence starts. Rows of one sequence stand in the order of time, so whatever selects whole sequences
-from a batch of rows selects a batch of rows. Sequences are padded and not packed, which is faster on a CPU; the padding
+from which that sequence starts. Rows of one sequence stand in the order of time, so whole sequences selected from a
+batch of rows are a batch of rows again. Sequences are padded and not packed, which is faster on a CPU; the padding
 follows the end of a sequence, where nothing depends on it.
 """
 

@@ -70,7 +70,7 @@ class EpisodeTracker:
                 self.pairs[env] = self.waiting.pop(0)
                 restarted.append(env)
             else:
-                # Its last candidate acts on in it: these steps are counted, and otherwise ignored
+                # Its last candidate keeps acting: these steps are only counted
                 self.active[env] = False
         self.deadline = self.max_episode_steps + int(self.started_at.min())
         return restarted

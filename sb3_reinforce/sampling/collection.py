@@ -120,7 +120,7 @@ def collect(
                 if not callback.on_step():
                     return None
         finally:
-            # The callback finds s_t there, as with A2C; what it fails on may be s_{t+1}
+            # As with A2C the callback finds s_t; where it fails, s_{t+1} is checked
             model._last_obs = new_obs  # type: ignore[assignment]
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards

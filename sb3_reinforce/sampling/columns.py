@@ -56,7 +56,11 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         for (step, env), obs in columns.terminal_obs.items()
     ]
     states = [columns.state for columns in all_columns]
-    known = next((state for state in states if state is not None), None)
+    known = next((each for each in states if each is not None), None)
+    state = None
+    if known is not None:
+        # A process whose environments all start episodes has no state
+        state = th.cat([th.zeros_like(known) if each is None else each for each in states]).to(device)
     return Columns(
         # An episode that ends beyond the quota does not count, and the padding ends none
         dones=side_by_side([columns.dones for columns in all_columns], n_steps),
@@ -64,10 +68,7 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         terminal_obs=dict(sorted(terminal_obs, key=lambda item: item[0])),
         last_obs=map_parts(lambda *parts: np.concatenate(parts), *(columns.last_obs for columns in all_columns)),
         quota=np.concatenate([columns.quota for columns in all_columns]),
-        # A process whose environments all start episodes has no state
-        state=None
-        if known is None
-        else th.cat([th.zeros_like(known) if each is None else each for each in states]).to(device),
+        state=state,
     )
 
 

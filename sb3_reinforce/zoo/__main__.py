@@ -86,7 +86,7 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
 
 def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -> None:
-    """Exit with a sentence for arguments that the Zoo would ignore, or end with a traceback for."""
+    """Exit with a sentence where the Zoo would ignore an argument or end with a traceback."""
     known = argparse.ArgumentParser(parser.prog, parser.usage, add_help=False, allow_abbrev=False)
     known.add_argument("--env", default="CartPole-v1")
     known.add_argument("--algo", default="ppo")
