@@ -40,7 +40,7 @@ uninterrupted = Uninterrupted()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise ``KeyboardInterrupt`` on SIGTERM too, unless the user handles it; no signal interrupts an update."""
+    """Raise ``KeyboardInterrupt`` on SIGTERM too, unless the user handles it; neither it nor Ctrl-C cuts an update."""
     replaced: dict[int, tuple[Any, Any]] = {}
     in_main_thread = threading.current_thread() is threading.main_thread()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -25,7 +25,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
-    # An array of the Box needs no check
+    # An array with the Box's dtype and shape needs no further check
     is_box = isinstance(env.observation_space, spaces.Box)
     rows: Any = env.buf_obs[None] if is_box else np.empty(0)  # type: ignore[index]
     form = (rows.dtype, rows.shape[1:])

@@ -104,7 +104,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
 
 
 def sizes_of(action_space: spaces.Space[Any]) -> list[int]:
-    """The number of actions in each dimension of a space whose actions can be masked."""
+    """The number of actions in each dimension of a Discrete or MultiDiscrete space."""
     if isinstance(action_space, spaces.Discrete):
         return [int(action_space.n)]
     if isinstance(action_space, spaces.MultiDiscrete):
