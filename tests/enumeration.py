@@ -71,26 +71,31 @@ def fill(model, batch):
     return buffer, dones
 
 
+def complete(model, buffer, dones, next_values=None):
+    """What the package makes of episodes that begin with the rollout: the rollout, advantages and returns."""
+    n_envs = dones.shape[1]
+    return complete_rollout(
+        buffer,
+        model.policy,
+        dones,
+        np.ones(n_envs, dtype=int),
+        Running.none(n_envs),
+        next_values,
+        baseline=BASELINES.get(str(model.baseline), model.baseline),
+        **{name: getattr(model, name) for name in ARGUMENTS},
+    )
+
+
 def rollout_of(model, batch):
-    """What the package makes of a batch of episodes: returns, masks, denominator and advantages."""
+    """A batch of episodes with returns, masks and denominator, and the baseline."""
     buffer, dones = fill(model, batch)
-    baseline = BASELINES.get(str(model.baseline), model.baseline)
     next_values = None
     if model.has_critic:
         route = route_of(model.policy, with_critic=True)
         last_obs = buffer.observations[-1]
         buffer.values, next_values = rollout_values(model.policy, route, buffer, dones, last_obs, {})
-    rollout, *_ = complete_rollout(
-        buffer,
-        model.policy,
-        dones,
-        np.ones(len(batch), dtype=int),
-        Running.none(len(batch)),
-        next_values,
-        baseline=baseline,
-        **{name: getattr(model, name) for name in ARGUMENTS},
-    )
-    return rollout, baseline(rollout)
+    rollout, *_ = complete(model, buffer, dones, next_values)
+    return rollout, BASELINES.get(str(model.baseline), model.baseline)(rollout)
 
 
 def estimate(model, batch):

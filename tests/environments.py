@@ -11,6 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
+from sb3_reinforce import GymnasiumVecEnv
+
 
 class Tree(gym.Env[np.ndarray, np.int64]):
     """Node 0, then node 1 or 2 by the first action; if ``ragged``, a first action 1 ends the episode."""
@@ -219,3 +221,8 @@ def of_two(**fault: Any) -> DummyVecEnv:
     """Two environments, of which the second has the fault."""
     both = {"observation_space": fault.get("observation_space"), "truncate": fault.get("truncate", False)}
     return DummyVecEnv([lambda: Faulty(**both), lambda: Faulty(**fault)])
+
+
+def native(n_envs: int, **kwargs: Any) -> GymnasiumVecEnv:
+    """Gymnasium's own vector environment of CartPole."""
+    return GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point", **kwargs))

@@ -21,6 +21,7 @@ KINDS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any]]] = {
 }
 all_kinds = pytest.mark.parametrize("kind", KINDS)
 both = pytest.mark.parametrize("kind", ["steps", "search"])
+both_extents = pytest.mark.parametrize("kind", ["steps", "episodes"])
 
 
 def make(kind: str, env: Any = "CartPole-v1", policy: str = "MlpPolicy", **kwargs: Any) -> Any:
@@ -121,3 +122,10 @@ class Scaled(FlattenExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return self.scale * super().forward(observations)
+
+
+class Dropping(FlattenExtractor):
+    """Flat observations, of which training mode drops half."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return th.nn.functional.dropout(super().forward(observations), 0.5, self.training)

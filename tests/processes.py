@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import pickle
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -16,6 +17,7 @@ import torch.distributed as dist
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 # Longer than a busy machine takes
 WAIT_SECONDS = 120
 

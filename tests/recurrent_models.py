@@ -30,10 +30,10 @@ class DoubleCombined(CombinedExtractor):
         return super().forward(observations).double()
 
 
-def make_recurrent(policy="MlpLstmPolicy", env=None, n_envs=2, double=True, policy_kwargs=None, **kwargs):
+def make_recurrent(policy="MlpLstmPolicy", env=None, double=True, policy_kwargs=None, **kwargs):
     """A small model with weights so large that memories matter."""
     if env is None:
-        env = make_vec_env(lambda: Random(SPACES[policy], lengths=(2, 5, 7)), n_envs, seed=0)
+        env = make_vec_env(lambda: Random(SPACES[policy], lengths=(2, 5, 7)), 2, seed=0)
     extractors = (DoubleCombined, CombinedExtractor) if policy == "MultiInputLstmPolicy" else (Double, FlattenExtractor)
     policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [3], **(policy_kwargs or {})}
     policy_kwargs["features_extractor_class"] = extractors[0 if double else 1]

@@ -40,8 +40,13 @@ class Levels(Line):
         return np.ones(1, np.float32), 50 * self.level + float(action[0]), True, False, {}
 
 
-def estimates(n_updates, env=None, **kwargs):
-    """Of as many updates at one θ."""
-    model, callback = make(env or Line(), learning_rate=0.0, delta_std=0.1, **kwargs), Record(lambda model: None)
+def estimates_of(model, n_updates):
+    """Of as many updates, after one of its training."""
+    callback = Record(lambda model: None)
     model.learn(1, callback)
     return [model.estimate_gradient(callback) for _ in range(n_updates)]
+
+
+def estimates(n_updates, env=None, **kwargs):
+    """Of as many updates at one θ."""
+    return estimates_of(make(env or Line(), learning_rate=0.0, delta_std=0.1, **kwargs), n_updates)

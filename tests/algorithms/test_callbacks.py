@@ -8,7 +8,7 @@ import torch as th
 from callbacks import Record
 from environments import Corridor
 from gymnasium import spaces
-from models import KINDS, all_kinds, make
+from models import KINDS, all_kinds, both_extents, make
 from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import REINFORCE
 
 
-@pytest.mark.parametrize("kind", ["steps", "episodes"])
+@both_extents
 def test_callbacks_find_the_locals_of_a2c(kind):
     """Also after a time limit, at which A2C has more."""
     env = make_vec_env(lambda: Corridor((4,), truncate=True), 2)
@@ -127,11 +127,6 @@ def test_the_logged_standard_deviation_is_the_mean_over_the_actions():
         model.policy.log_std.copy_(th.tensor([0.5, -1.0]))
     std = model.learn(6).logger.name_to_value["train/std"]
     assert std == pytest.approx((np.exp(0.5) + np.exp(-1.0)) / 2)
-
-
-def test_tensorboard(tmp_path):
-    make("steps", tensorboard_log=tmp_path).learn(32, log_interval=100)
-    assert list((tmp_path / "REINFORCE_1").glob("events*"))
 
 
 @pytest.mark.parametrize("mode", [{"n_steps": 8}, {"n_episodes": 5}])

@@ -4,15 +4,16 @@ import copy
 import gc
 import pickle
 import weakref
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from callbacks import Record
-from environments import Corridor, Random, Reused
+from environments import Corridor, Random, Reused, native
 from gymnasium import spaces
-from models import KINDS, Scaled, all_kinds, make, moved_by_learning
+from models import KINDS, Scaled, all_kinds, both_extents, make, moved_by_learning
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -20,11 +21,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 from sb3_reinforce import REINFORCE, reinforce
 from sb3_reinforce.common import settings
 from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback, compare_baselines, landscape
-from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 from sb3_reinforce.estimation import weights
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
-both_modes = pytest.mark.parametrize("kind", ["steps", "episodes"])
 FLAT = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
 DICT = spaces.Dict({"image": IMAGE, "flat": FLAT, "n": spaces.Discrete(3)})
@@ -106,10 +105,6 @@ def test_numbers_of_environments(n_envs, kind):
     assert model.num_timesteps >= 8 * n_envs and model._n_updates >= 1
 
 
-def gymnasium_env():
-    return VecMonitor(GymnasiumVecEnv(gym.make_vec("CartPole-v1", 3, vectorization_mode="vector_entry_point")))
-
-
 def parameters_after_training(kind, env):
     env.seed(5)
     model = make(kind, env, seed=5).learn(300)
@@ -125,7 +120,7 @@ def test_the_same_seed_gives_the_same_parameters(kind):
         for vec_env_cls in (DummyVecEnv, DummyVecEnv, SubprocVecEnv)
     )
     assert all(map(th.equal, dummy, again)) and all(map(th.equal, dummy, subproc))
-    assert all(map(th.equal, *(parameters_after_training(kind, gymnasium_env()) for _ in range(2))))
+    assert all(map(th.equal, *(parameters_after_training(kind, VecMonitor(native(3))) for _ in range(2))))
 
 
 @all_kinds
@@ -199,7 +194,7 @@ def test_by_default_each_environment_has_an_episode(n_envs, n_processes, n_episo
     assert (recurrent.n_steps, recurrent.n_episodes) == (None, n_episodes)
 
 
-@both_modes
+@both_extents
 def test_a_vec_env_may_reuse_its_arrays(kind):
     outcomes = []
     for wrapper in (lambda env: env, Reused):
@@ -229,14 +224,15 @@ def test_the_policy_can_be_pickled_and_copied():
         assert all(map(th.equal, policy.parameters(), other.parameters()))
 
 
+@pytest.mark.parametrize("callback", [PitfallCallback, partial(GradientQualityCallback, 1)])
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
-def test_the_policy_can_be_copied_where_a_callback_has_measured(env):
+def test_the_policy_can_be_copied_where_a_callback_has_measured(env, callback):
     def can_be_copied(model):
         return all(map(th.equal, copy.deepcopy(model.policy).parameters(), model.policy.parameters()))
 
     copies = Record(can_be_copied)
     model = make("episodes", gym.make(env, max_episode_steps=20), baseline="optimal")
-    model.learn(1, [PitfallCallback(), GradientQualityCallback(1), copies])
+    model.learn(1, [callback(), copies])
     assert copies.records == [True]
     for measure in (compare_baselines, landscape):
         measure(model, n_episodes=3)

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
-from searches import Levels, Line, estimates, make
+from searches import Levels, Line, estimates, estimates_of, make
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
@@ -57,12 +57,11 @@ def test_all_episodes_of_a_pair_have_seeds_that_no_other_pair_has():
 @pytest.mark.parametrize("bound", [None, 0.01])
 @pytest.mark.parametrize("standardize", [True, False])
 def test_the_step_is_the_gradient_scaled_and_clipped(standardize, bound):
-    callback = Record(lambda model: None)
     model = make(
         Line(), learning_rate=0.0, delta_std=0.1, standardize_utilities=standardize, max_grad_norm=bound,
         policy_kwargs={"optimizer_class": th.optim.SGD},
-    ).learn(1, callback)  # fmt: skip
-    estimate = model.estimate_gradient(callback)
+    )  # fmt: skip
+    (estimate,) = estimates_of(model, 1)
     theta = model.theta
     model.learning_rate = 1.0
     model.train(estimate)
@@ -90,10 +89,8 @@ def test_the_standard_error_is_the_spread_of_the_gradient(estimator, common_rand
 
 def test_the_fit_of_central_differences_is_the_regression_within_pairs():
     """Of (U₊ − U₋) / 2 on δ without an intercept: what the start of a pair adds is not left to explain."""
-    callback = Record(lambda model: None)
-    env = make_vec_env(Levels, 4, seed=0)
-    model = make(env, n_delta=6, deterministic=False, learning_rate=0.0).learn(1, callback)
-    estimate = model.estimate_gradient(callback)
+    model = make(make_vec_env(Levels, 4, seed=0), n_delta=6, deterministic=False, learning_rate=0.0)
+    (estimate,) = estimates_of(model, 1)
     model.train(estimate)
     plus, minus = estimate.utilities.reshape(2, 6)
     x = (estimate.candidates.reshape(2, 6)[0] - model.theta).numpy()
@@ -110,9 +107,8 @@ def test_the_fit_of_central_differences_is_the_regression_within_pairs():
 
 @pytest.mark.parametrize("level", [0.7, -200.0, 1e6])
 def test_utilities_that_differ_by_rounding_make_no_step(level):
-    callback = Record(lambda model: None)
-    model = make(Line(), learning_rate=0.0, policy_kwargs={"optimizer_class": th.optim.SGD}).learn(1, callback)
-    estimate = model.estimate_gradient(callback)
+    model = make(Line(), learning_rate=0.0, policy_kwargs={"optimizer_class": th.optim.SGD})
+    (estimate,) = estimates_of(model, 1)
     theta = model.theta
     model.learning_rate = 1.0
     equal = level + abs(level) * 1.5e-16 * th.arange(6.0).double()
@@ -124,9 +120,8 @@ def test_utilities_that_differ_by_rounding_make_no_step(level):
 
 
 def test_the_mean_of_the_standard_errors_is_logged():
-    callback = Record(lambda model: None)
-    model = make(estimator="regression", n_delta=30, learning_rate=0.0).learn(1, callback)
-    estimate = model.estimate_gradient(callback)
+    model = make(estimator="regression", n_delta=30, learning_rate=0.0)
+    (estimate,) = estimates_of(model, 1)
     model.train(estimate)
     errors = fit_quality(estimate.candidates, estimate.utilities, estimate.gradient, estimate.columns).standard_error
     assert errors.std() > 0
@@ -169,16 +164,18 @@ def test_an_update_is_finished_and_none_starts_after_the_end():
     assert starts.records[-1] < 300 <= model.num_timesteps and len(starts.records) == model._n_updates
 
 
-def test_schedules_end_at_zero_and_never_below():
+def test_schedules_see_the_progress_from_one_down_and_never_below_zero():
     seen, scales = [], []
     model = make(
         learning_rate=lambda progress: seen.append(progress) or 0.1 * progress,
         delta_std=lambda progress: 0.01 + 0.1 * progress,
     )
+    # At construction they are checked at both ends
+    seen.clear()
     for n_steps in (1, 300, 300):
         model.learn(n_steps, log_interval=None, reset_num_timesteps=False)
         scales.append(model.logger.name_to_value["train/delta_std"])
-    assert min(seen) >= 0 and max(seen) <= 1
+    assert 0 <= min(seen) < max(seen) == 1
     assert 0.01 <= scales[2] < scales[0] == 0.11
 
 

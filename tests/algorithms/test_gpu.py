@@ -11,6 +11,7 @@ import torch as th
 from environments import Tree
 from gymnasium import spaces
 from models import Double, float64
+from processes import TORCHRUN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.utils import set_random_seed
@@ -142,6 +143,15 @@ def test_the_laboratory_measures_on_a_gpu(kind):
         assert np.isfinite([row.variance.value for row in compare_baselines(model, 8, n_resamples=2)]).all()
 
 
+def test_generators_of_gpus_go_on_after_a_measurement():
+    model = REINFORCE("MlpPolicy", Tree(), device="cuda")
+    before = th.cuda.get_rng_state_all()
+    tables = [compare_baselines(model, 20, n_resamples=2).to_records() for _ in range(2)]
+    assert [row["variance"] for row in tables[0]] == [row["variance"] for row in tables[1]]
+    assert check_gradient(model).passed
+    assert all(map(th.equal, th.cuda.get_rng_state_all(), before))
+
+
 TRAIN = """
 import os, sys
 import torch as th
@@ -158,9 +168,8 @@ for kind in KINDS:
 @pytest.mark.parametrize("devices", [("cuda", "cuda"), ("cuda", "cpu"), ("cpu", "cuda")])
 def test_two_processes_learn_on_any_devices(devices, tmp_path):
     (tmp_path / "train.py").write_text(TRAIN)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([*command, tmp_path / "train.py", *devices, tmp_path], env=environment, timeout=300, check=True)
+    subprocess.run([*TORCHRUN, tmp_path / "train.py", *devices, tmp_path], env=environment, timeout=300, check=True)
     for kind in KINDS:
         (first, steps), (second, _) = [th.load(tmp_path / f"{kind} {rank}") for rank in range(2)]
         assert steps >= 300

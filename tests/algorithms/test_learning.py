@@ -2,8 +2,8 @@
 
 import itertools
 
-import gymnasium as gym
 import pytest
+from environments import native
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import IdentityEnv, IdentityEnvBox, IdentityEnvMultiBinary, IdentityEnvMultiDiscrete
@@ -11,7 +11,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 ENVS = [IdentityEnv, IdentityEnvMultiDiscrete, IdentityEnvMultiBinary, IdentityEnvBox]
 CASES = [*itertools.product(ENVS, ["leave_one_out", "value"]), (IdentityEnv, "none"), (IdentityEnv, "time_mean")]
@@ -53,9 +52,6 @@ def test_cart_pole_is_solved(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_cart_pole_is_solved_on_a_native_vector_environment(seed):
-    env, eval_env = (
-        VecMonitor(GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point")))
-        for n_envs in (256, 5)
-    )
+    env, eval_env = (VecMonitor(native(n_envs)) for n_envs in (256, 5))
     model = REINFORCE("MlpPolicy", env, n_steps=8, gae_lambda=0.95, seed=seed, device="cpu", batch_size=512)
     assert score(model.learn(1_000_000, callback=stop_at_490(eval_env, 40)), seed) >= 475

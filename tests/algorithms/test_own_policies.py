@@ -44,18 +44,6 @@ def test_the_critic_is_fitted_to_the_values_that_are_the_baseline():
     assert model.rollout.values.mean().item() == pytest.approx(5, abs=0.2)
 
 
-def exchange(model):
-    model.policy = type(model.policy)(model.observation_space, model.action_space, model.lr_schedule)
-    with th.no_grad():
-        model.policy.value_net.bias.fill_(100.0)
-
-
-def test_a_policy_that_a_callback_exchanges_is_valued_by_its_own_critic():
-    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=16, learning_rate=0.0, seed=0, device="cpu")
-    model.learn(16, callback=At(4, exchange))
-    assert (model.rollout.values > 90).all()
-
-
 def test_a_checkpoint_of_the_middle_of_a_rollout_can_be_measured(tmp_path):
     model = make("steps", Corridor((3,)))
     model.learn(16, callback=At(5, lambda model: model.save(tmp_path / "model")))

@@ -7,7 +7,7 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
-from models import make
+from models import both, make
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_reinforce import REINFORCE
@@ -60,7 +60,7 @@ def test_the_schedule_of_the_entropy_bonus_is_followed():
     assert norms[0] == pytest.approx(norms[1]) and norms[2] > 2 * norms[1]
 
 
-@pytest.mark.parametrize("kind", ["steps", "search"])
+@both
 @pytest.mark.parametrize(("name", "value"), [("learning_rate", 0.25), ("lr_schedule", lambda progress: 0.25)])
 def test_a_learning_rate_set_later_is_the_rate_of_each_optimizer(name, value, kind):
     model = make(kind, learning_rate=1e-3).learn(16)
@@ -160,9 +160,11 @@ def test_a_floor_that_a_callback_sets_at_the_start_of_a_rollout_holds_for_the_no
 
 def test_what_a_callback_sets_is_used():
     values = {"ent_coef": 1e6, "temperature": 3.0, "gamma": 0.5}
-    model = make("steps", max_grad_norm=None).learn(32, callback=At(8, lambda model: vars(model).update(values)))
+    model = make("steps", Corridor((100,)), max_grad_norm=None)
+    returns = model.learn(32, callback=At(8, lambda model: vars(model).update(values))).rollout.returns
     assert model.logger.name_to_value["train/grad_norm"] > 100
     assert temperature_of(model) == pytest.approx(3)
+    th.testing.assert_close(returns[:-1], 1 + 0.5 * returns[1:])
 
 
 def test_a_policy_that_is_saved_alone_has_no_temperature(tmp_path):

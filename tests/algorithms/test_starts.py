@@ -273,7 +273,8 @@ def test_a_vec_env_need_not_be_seeded(name):
 
 def test_memory_takes_one_episode_of_each_environment():
     model = RecurrentREINFORCE("MlpLstmPolicy", DummyVecEnv([Scales] * 8), baseline="optimal", episodes_per_start=4)
-    assert model.learn(8).rollout.episodes_per_start == 4
+    rollout = model.learn(8).rollout
+    assert rollout.groups.tolist() == [[0] * 4 + [1] * 4] and rollout.used.all()
 
 
 def test_a_model_can_be_loaded_for_other_numbers_of_environments(tmp_path):

@@ -5,7 +5,7 @@ import torch as th
 from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
-from models import Experts, Normalized, Scaled, all_kinds, make, moved_by_learning, plain
+from models import Experts, Normalized, Scaled, all_kinds, both_extents, make, moved_by_learning, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -286,7 +286,7 @@ def test_a_policy_may_return_the_mean_entropy():
     assert norms[0] == pytest.approx(norms[1])
 
 
-@pytest.mark.parametrize("kind", ["steps", "episodes"])
+@both_extents
 def test_environments_that_a_callback_sets_at_the_start_of_a_rollout_are_used_in_it(kind):
     env, other = (make_vec_env(lambda: Corridor((3, 9)), 2) for _ in range(2))
     switch = Record(lambda model: model.num_timesteps and model.env is env and model.set_env(other), "rollout_start")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import Record
-from models import KINDS, both, make, plain
+from models import KINDS, both, both_extents, make, plain
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -269,7 +269,7 @@ def test_integers_of_numpy(kind, tmp_path):
     type(model).load(tmp_path / "model", env=gym.make("CartPole-v1"), **given).learn(16)
 
 
-@pytest.mark.parametrize("kind", ["steps", "episodes"])
+@both_extents
 def test_without_gradients_nothing_is_learned_in_silence(kind):
     model = make(kind)
     with th.no_grad(), pytest.raises(ValueError, match="gradients"):

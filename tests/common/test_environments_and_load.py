@@ -16,7 +16,17 @@ from sb3_reinforce import REINFORCE, FiniteDifference
 
 
 @both
-@pytest.mark.parametrize("env", [None, 3, gym.make_vec("CartPole-v1", 2)], ids=["None", "3", "VectorEnv"])
+@pytest.mark.parametrize(
+    "env",
+    [
+        None,
+        3,
+        gym.make_vec("CartPole-v1", 2),
+        type("Task", (gym.Env,), {"observation_space": spaces.Box(-1, 1, (3,)), "action_space": spaces.Discrete(2)}),
+        SimpleNamespace(observation_space=spaces.Box(-1, 1, (3,)), action_space=spaces.Discrete(2)),
+    ],
+    ids=["None", "3", "VectorEnv", "class", "other library"],
+)
 def test_env_must_be_an_environment(kind, env):
     with pytest.raises(TypeError, match="env must be"):
         make(kind, env)
@@ -138,20 +148,6 @@ def test_a_space_that_no_policy_can_see_or_act_in(kind, name, space, problem):
     setattr(env, name, space)
     with pytest.raises(ValueError, match=f"^{name}{problem}"):
         make(kind, env, "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy")
-
-
-@both
-@pytest.mark.parametrize(
-    "env",
-    [
-        type("Task", (gym.Env,), {"observation_space": spaces.Box(-1, 1, (3,)), "action_space": spaces.Discrete(2)}),
-        SimpleNamespace(observation_space=spaces.Box(-1, 1, (3,)), action_space=spaces.Discrete(2)),
-    ],
-    ids=["class", "other library"],
-)
-def test_what_is_no_environment(env, kind):
-    with pytest.raises(TypeError, match=r"env must be a gymnasium.Env, a VecEnv or a registered id, got"):
-        make(kind, env)
 
 
 def test_an_environment_of_the_older_library_is_converted_by_stable_baselines3():

@@ -138,3 +138,23 @@ def test_a_block_within_a_block_waits_for_the_end_of_both():
             signal.raise_signal(signal.SIGINT)
         finished.append(True)
     assert finished
+
+
+def test_a_block_in_another_thread_delays_no_signal():
+    inside, end = threading.Event(), threading.Event()
+
+    def block():
+        with uninterrupted:
+            inside.set()
+            end.wait()
+
+    thread = threading.Thread(target=block)
+    thread.start()
+    inside.wait()
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            signal.raise_signal(signal.SIGINT)
+            pytest.fail("the signal waits for the other thread")
+    finally:
+        end.set()
+        thread.join()

@@ -4,7 +4,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from functools import partial
 from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client
@@ -14,7 +13,7 @@ import pytest
 from callbacks import At
 from environments import Corridor
 from models import KINDS, make, plain
-from processes import in_processes
+from processes import TORCHRUN, in_processes
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce.common import processes
@@ -136,9 +135,8 @@ finally:
 
 def test_torchrun_is_found_and_the_model_is_saved_after_a_process_has_died(tmp_path):
     (tmp_path / "train.py").write_text(SCRIPT)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     script = [tmp_path / "train.py", tmp_path / "model"]
-    ended = subprocess.run([*command, *script], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run([*TORCHRUN, *script], capture_output=True, text=True, timeout=120)
     assert f"ProcessError: {DEAD}" in ended.stderr
     # Only process 0 prints
     assert ended.stdout.count("Using cpu device") == 1

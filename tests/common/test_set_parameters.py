@@ -174,6 +174,8 @@ def test_parameters_of_other_algorithms(kind, other, same_optimizer, tmp_path):
         assert bool(model.policy.optimizer.state_dict()["state"]) == same_optimizer
         assert len(caught) == (0 if same_optimizer else 1)
         model.learn(32)
+    trained.set_parameters({"policy": model.get_parameters()["policy"]}, exact_match=False)
+    assert plain(trained.policy.state_dict()) == plain(model.policy.state_dict())
 
 
 class Masked(ActorCriticPolicy):

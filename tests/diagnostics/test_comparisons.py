@@ -35,7 +35,7 @@ class GaussianBandit(Corridor):
         return self.np_random.normal([3.0, 5.0][action], 2.0)
 
 
-def bandit(better=0.5, **kwargs):
+def bandit(better=0.5):
     """A model that takes the better action, of mean 5, with a probability."""
     model = REINFORCE(
         "MlpPolicy",
@@ -43,7 +43,6 @@ def bandit(better=0.5, **kwargs):
         policy_kwargs={"net_arch": []},
         seed=0,
         device="cpu",
-        **kwargs,
     )
     with th.no_grad():
         for parameter in model.policy.parameters():
@@ -148,15 +147,6 @@ def test_a_progress_bar_counts_the_episodes(capsys):
     for compare, n, shown in ((compare_baselines, 20, "20/20"), (compare_starts, 6, "48/48")):
         compare(model, n, progress_bar=True)
         assert f"| {shown} [" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("measure", [compare_baselines, compare_starts, sample])
-def test_a_wrong_progress_bar_is_named_before_anything_is_sampled(measure):
-    model = REINFORCE("MlpPolicy", make_vec_env(lambda: Tree(), 2, seed=0), device="cpu").learn(8)
-    before = model._last_obs
-    with pytest.raises(TypeError, match="progress_bar must be True or False, got 'x'"):
-        measure(model, 6, progress_bar="x")
-    assert model._last_obs is before
 
 
 def test_bias_is_told_where_theory_knows_it():

@@ -7,9 +7,9 @@ import cloudpickle
 import numpy as np
 import pytest
 from callbacks import At
-from environments import Corridor, Faulty, Wrapper, of_two
+from environments import Faulty, Wrapper, of_two
 from gymnasium import spaces
-from models import KINDS, all_kinds, make, plain
+from models import KINDS, all_kinds, both_extents, make, plain
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -92,7 +92,7 @@ def test_numbers_that_are_not_finite(name, wrapper, kind):
         assert_finite_statistics(env)
 
 
-@pytest.mark.parametrize("kind", ["steps", "episodes"])
+@both_extents
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_a_terminal_observation_behind_vec_normalize(kind, value):
     env = VecFrameStack(VecNormalize(of_two(fault="observation", at=7, value=bad(value), truncate=True)), 2)
@@ -112,7 +112,7 @@ def test_an_observation_of_the_very_last_step(truncate):
 
 
 @bare_or_normalized
-@pytest.mark.parametrize("kind", ["steps", "episodes"])
+@both_extents
 def test_actions_that_are_not_finite_are_not_blamed_on_the_environment(kind, wrapper):
     """The standard deviation of gSDE overflows."""
     model = make(kind, wrapper(make_vec_env("Pendulum-v1", 2)), use_sde=True)
@@ -269,9 +269,3 @@ def test_learning_within_a_callback(fault, kind):
 def test_what_float32_cannot_hold_is_named_whatever_numpy_warns_of(value):
     with np.errstate(over="raise"), pytest.raises(BadData, match=r"of environment 1 is not finite.*float32 ends at"):
         check_finite("The reward", np.array([0.0, value]), (None,))
-
-
-def test_discounts_may_underflow():
-    """Also for users who let NumPy raise errors."""
-    with np.errstate(under="raise"):
-        assert make("episodes", Corridor((330,)), gamma=0.1).learn(1)._n_updates == 1

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from environments import Corridor, Faulty, Random, of_two
 from gymnasium import spaces
-from models import all_kinds, make
+from models import all_kinds, both, make
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -34,7 +34,7 @@ WHEN = {
 }
 
 
-@pytest.mark.parametrize("kind", ["steps", "search"])
+@both
 @pytest.mark.parametrize("name", MALFORMED)
 @pytest.mark.parametrize("when", WHEN)
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecMonitor, VecNormalize])
@@ -126,7 +126,7 @@ def test_other_forms_of_a_reward_are_accepted(value, kind):
     assert model.ep_info_buffer[0]["r"] == 3 * float(value)
 
 
-@pytest.mark.parametrize("kind", ["steps", "search"])
+@both
 def test_what_a_dict_has_besides_its_space_is_left_alone(kind):
     """Also in the last observation before a time limit, whose value the critic predicts."""
 

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Corridor, Random
+from environments import Corridor, Random, native
 from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
@@ -21,10 +21,6 @@ from sb3_reinforce.diagnostics import landscape
 from sb3_reinforce.envs.vec_env import GymnasiumVecEnv
 
 N_ENVS = 3
-
-
-def native(n_envs=N_ENVS, **kwargs):
-    return GymnasiumVecEnv(gym.make_vec("CartPole-v1", n_envs, vectorization_mode="vector_entry_point", **kwargs))
 
 
 def synced(env_fn, mode="SameStep", vector_env=SyncVectorEnv, **kwargs):
@@ -93,7 +89,7 @@ def test_every_transition_is_that_of_a_dummy_vec_env_and_stays_as_it_was(mode, t
 
 def test_every_transition_of_the_native_cart_pole_is_that_of_the_single_one():
     """Started from the same states, over terminations and truncations; a new episode starts where the reset says."""
-    ours = native(max_episode_steps=30)
+    ours = native(N_ENVS, max_episode_steps=30)
     obs = ours.reset()
     singles = [gym.make("CartPole-v1").unwrapped for _ in range(N_ENVS)]
     steps, ends, rng = np.zeros(N_ENVS, dtype=int), {True: 0, False: 0}, np.random.default_rng(1)
@@ -172,12 +168,12 @@ def test_attributes_and_methods_where_the_environment_can():
     assert wrapped.env_is_wrapped(gym.wrappers.TimeLimit, indices=[0, 2]) == [True, True]
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("truncate", True, indices=[0])
-    assert native().get_attr("max_episode_steps") == [500] * N_ENVS
+    assert native(N_ENVS).get_attr("max_episode_steps") == [500] * N_ENVS
     below = CartPoleVectorEnv(N_ENVS)
     below.metadata = below.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
     assert GymnasiumVecEnv(VectorWrapper(below)).get_attr("max_episode_steps") == [500] * N_ENVS
     with pytest.raises(NotImplementedError, match="single copies"):
-        native().env_method("render")
+        native(N_ENVS).env_method("render")
     env = synced(Corridor, vector_env=AsyncVectorEnv)
     assert env.env_method("has_wrapper_attr", "lengths") == [True] * N_ENVS
     for indices in ([0], [1, 0, 2], [0, 0, 0]):
@@ -199,11 +195,11 @@ def test_evaluation_finds_a_monitor(vector_env):
 
 def test_finite_difference_trains_on_it():
     """With seeded starts where there are single copies to seed; elsewhere an error says what to set."""
-    for env, is_seeded in ((synced(Corridor), True), (native(), False)):
+    for env, is_seeded in ((synced(Corridor), True), (native(N_ENVS), False)):
         model = FiniteDifference("LinearPolicy", env, n_delta=12, common_random_numbers=is_seeded, seed=0)
         assert model.learn(50)._n_updates > 0
     with pytest.raises(ValueError, match="common_random_numbers=False"):
-        FiniteDifference("LinearPolicy", native(), n_delta=12).learn(50)
+        FiniteDifference("LinearPolicy", native(N_ENVS), n_delta=12).learn(50)
 
 
 def test_pictures_in_one_array():
@@ -275,8 +271,7 @@ class Numbers(SyncVectorEnv):
 @pytest.mark.parametrize("form", [np.asarray, list])
 def test_episodes_may_end_by_numbers(form):
     plain, numbers = [
-        GymnasiumVecEnv(kind([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=AutoresetMode.DISABLED))
-        for kind in (SyncVectorEnv, Numbers)
+        synced(lambda: Corridor((2, 3, 5)), "Disabled", vector_env) for vector_env in (SyncVectorEnv, Numbers)
     ]
     numbers.env.form = form
     for env in (plain, numbers):
@@ -300,12 +295,19 @@ def test_other_forms_of_observations_are_accepted(form):
     assert make("steps", env).learn(100).num_timesteps >= 100
 
 
-def test_each_row_of_other_numbers_is_checked():
-    env = synced(lambda: Random(spaces.Box(0, 255, (4,), np.uint8)), vector_env=Malformed)
+@pytest.mark.parametrize(
+    ("space", "added", "message"),
+    [
+        (spaces.Box(0, 255, (4,), np.uint8), 0.5, "must have .* that fits uint8"),
+        (spaces.MultiDiscrete([2, 3]), 9, "must be in MultiDiscrete"),
+    ],
+)
+def test_each_row_of_other_numbers_is_checked(space, added, message):
+    env = synced(lambda: Random(space), vector_env=Malformed)
     env.env.change = lambda obs, rewards: (obs.astype(np.float32), rewards)
     assert make("steps", env).learn(100).num_timesteps >= 100
-    env.env.n_steps, env.env.change = 0, lambda obs, rewards: (obs + np.array([[0], [0.5], [0]]), rewards)
-    with pytest.raises(ValueError, match=r"observation of environment 1 must have .* that fits uint8"):
+    env.env.n_steps, env.env.change = 0, lambda obs, rewards: (obs + np.array([[0], [added], [0]]), rewards)
+    with pytest.raises(ValueError, match=f"observation of environment 1 {message}"):
         make("steps", env).learn(100)
 
 
@@ -359,18 +361,6 @@ def test_environments_of_one_class_with_different_modes(mode, monkeypatch):
     adapter.reset()
     # Each step is a whole episode, with no step in between that only resets
     assert all(step(adapter)[2].all() for _ in range(3))
-
-
-def test_each_row_that_is_no_box_is_checked():
-    class Wrong(SyncVectorEnv):
-        def step(self, actions):
-            obs, *rest = super().step(actions)
-            return obs + np.array([[0], [9], [0]]), *rest
-
-    env = synced(lambda: Random(spaces.MultiDiscrete([2, 3])), vector_env=Wrong)
-    env.reset()
-    with pytest.raises(ValueError, match=r"observation of environment 1 must be in MultiDiscrete"):
-        env.step(np.zeros(N_ENVS, int))
 
 
 def test_only_gymnasiums_own_cart_pole_is_reset_within_the_step():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from callbacks import At
 from environments import Corridor, Faulty
-from models import make
+from models import both, make
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 # Python warns of fork beside threads; here it is what is tested
@@ -177,7 +177,7 @@ def test_rewards_that_are_arrays_of_one_number(workers):
     assert env.ret_rms.mean.shape == () and env.returns.shape == (3,)
 
 
-@pytest.mark.parametrize("kind", ["steps", "search"])
+@both
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_an_interrupted_step(number, kind, workers):
     """Its unread answers are not taken for those to the next question."""

@@ -7,6 +7,7 @@ import torch as th
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation import BASELINES, Rollout, leave_one_out, mean, none, time_mean
+from sb3_reinforce.estimation.baselines import sum_of_others
 from sb3_reinforce.estimation.weights import compute_advantages
 
 
@@ -90,3 +91,7 @@ def test_optimal_is_zero_where_no_other_episode_has_a_score():
 def test_timesteps_of_a_very_long_episode_cost_no_memory():
     late = make_rollout([[1.0, 2.0]], [[1, 1]], [[10**12, 10**12]])
     assert leave_one_out(late).tolist() == [[2, 1]]
+
+
+def test_the_sum_of_others_keeps_what_is_small_beside_the_one_left_out():
+    assert sum_of_others(th.tensor([1e20, 1.0, 2.0], dtype=th.float64)).tolist() == [3.0, 1e20, 1e20]

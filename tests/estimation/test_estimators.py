@@ -26,6 +26,11 @@ def linear(seed):
     return lambda x: x @ slope + 7, slope
 
 
+def exponential(x):
+    """A utility whose gradient is exp(x)."""
+    return x.exp().sum(-1)
+
+
 @SEEDS
 def test_all_are_exact_on_linear_utilities(seed):
     utility, slope = linear(seed)
@@ -52,10 +57,7 @@ def test_the_error_is_of_the_declared_order(name, order):
     theta = th.linspace(-1, 1, N, dtype=th.float64)
     deltas = normal(3 * N, N, seed=0)
     sizes = 2.0 ** -np.arange(4, 10)
-    gradient = th.exp(theta)
-    errors = [
-        float((ESTIMATORS[name](lambda x: x.exp().sum(-1), theta, size * deltas) - gradient).norm()) for size in sizes
-    ]
+    errors = [float((ESTIMATORS[name](exponential, theta, size * deltas) - theta.exp()).norm()) for size in sizes]
     measured, _ = np.polyfit(np.log(sizes), np.log(errors), 1)
     assert measured == pytest.approx(order, abs=0.1)
 
@@ -91,14 +93,10 @@ def test_nearly_collinear_perturbations_are_solved_to_what_their_condition_allow
 
 def test_n_top_is_the_central_difference_of_the_best_perturbations():
     theta, deltas = th.zeros(N).double(), normal(6, N, seed=0)
-
-    def utility(x):
-        return x.exp().sum(-1)
-
-    best = th.maximum(utility(deltas), utility(-deltas)).argsort(descending=True)[:2]
+    best = th.maximum(exponential(deltas), exponential(-deltas)).argsort(descending=True)[:2]
     for n_top, rows in ((2, deltas[best]), (6, deltas)):
-        estimate = central_difference(utility, theta, deltas, n_top=n_top)
-        th.testing.assert_close(estimate, central_difference(utility, theta, rows))
+        estimate = central_difference(exponential, theta, deltas, n_top=n_top)
+        th.testing.assert_close(estimate, central_difference(exponential, theta, rows))
 
 
 def test_n_top_ranks_a_pair_by_its_better_utility():
@@ -129,16 +127,12 @@ def test_perturbations_that_do_not_fit_theta_are_an_error_before_anything_is_eva
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_perturbations_may_be_of_another_precision(name):
     theta, deltas = th.zeros(N).double(), normal(2 * N, N, seed=0).float()
-
-    def utility(x):
-        return x.exp().sum(-1)
-
-    expected = ESTIMATORS[name](utility, theta, deltas.double())
-    assert th.equal(ESTIMATORS[name](utility, theta, deltas), expected)
+    expected = ESTIMATORS[name](exponential, theta, deltas.double())
+    assert th.equal(ESTIMATORS[name](exponential, theta, deltas), expected)
     coordinates = th.eye(N, dtype=th.long)
-    expected = ESTIMATORS[name](utility, theta, coordinates.double())
-    assert th.equal(ESTIMATORS[name](utility, theta, coordinates), expected)
-    single = ESTIMATORS[name](lambda x: utility(x).float(), theta, coordinates)
+    expected = ESTIMATORS[name](exponential, theta, coordinates.double())
+    assert th.equal(ESTIMATORS[name](exponential, theta, coordinates), expected)
+    single = ESTIMATORS[name](lambda x: exponential(x).float(), theta, coordinates)
     th.testing.assert_close(single, expected, rtol=1e-5, atol=1e-5)
 
 

@@ -8,7 +8,7 @@ import torch as th
 from callbacks import At
 from environments import Corridor, Random
 from gymnasium import spaces
-from models import Scaled, moved_by_learning
+from models import Dropping, Scaled, moved_by_learning
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -127,13 +127,6 @@ def test_a_hook_on_a_parameter_of_the_critic_is_called():
     assert th.equal(model.policy.value_net.weight, before)
 
 
-class Dropping(FlattenExtractor):
-    """Flat observations, of which training drops half."""
-
-    def forward(self, observations):
-        return th.nn.functional.dropout(super().forward(observations), 0.5, self.training)
-
-
 @pytest.mark.parametrize("share", [True, False])
 def test_only_an_extractor_that_does_not_move_is_kept(share):
     """Dropout draws other masks in each pass; an extractor that the actor shares is in evaluation mode."""
@@ -157,9 +150,10 @@ def test_values_of_the_policy_step_are_those_of_predict_values(policy):
     ).all()
 
 
-def test_values_are_those_of_the_policy_that_a_callback_has_set():
-    """Also of the steps before it, whose values had come along with the actions."""
-    kwargs = {"net_arch": [4], "features_extractor_class": Scaled}
+@pytest.mark.parametrize("extractor", [FlattenExtractor, Scaled])
+def test_values_are_those_of_the_policy_that_a_callback_has_set(extractor):
+    """Also of the steps before it, whose values come from plain layers, or had come along with the actions."""
+    kwargs = {"net_arch": [4], "features_extractor_class": extractor}
     model, other = (make(seed=seed, learning_rate=0.0, policy_kwargs=kwargs) for seed in range(2))
     model.learn(1, At(3, lambda model: setattr(model, "policy", other.policy)))
     with th.no_grad():

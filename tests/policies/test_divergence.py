@@ -8,10 +8,10 @@ import torch as th
 from callbacks import Record
 from enumeration import make_model
 from environments import Corridor
+from models import Normalized
 from recurrent_models import make_recurrent
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback
@@ -37,15 +37,11 @@ def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
     assert found == pytest.approx(float(expected), rel=1e-10)
 
 
-class Unsteady(FlattenExtractor):
+class Unsteady(Normalized):
     """Its features differ in training mode, in which each pass changes them."""
 
-    def __init__(self, space):
-        super().__init__(space)
-        self.norm = th.nn.BatchNorm1d(self.features_dim)
-
     def forward(self, observations):
-        return th.nn.functional.dropout(self.norm(super().forward(observations)), 0.5, self.training)
+        return th.nn.functional.dropout(super().forward(observations), 0.5, self.training)
 
 
 LOGGED = {

@@ -92,11 +92,11 @@ def test_the_gradient_lab_measures_a_masked_policy():
 
 
 class Forced(Masked):
-    """Allows one action only, but for every tenth step."""
+    """Allows one action only, but for every thirtieth step."""
 
     def observe(self):
         obs = super().observe()
-        self.parts[0][:] = self.n_steps % 10 == 0
+        self.parts[0][:] = self.n_steps % 30 == 0
         self.parts[0][0] = True
         return obs
 

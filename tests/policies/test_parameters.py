@@ -6,14 +6,11 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from models import Normalized
-from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
-from sb3_reinforce.policies.parameters import searched_parameters
 
 OBS, ACTIONS = spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,))
 
@@ -87,19 +84,6 @@ def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
     assert th.equal(other.theta, search.theta)
 
 
-# A2C has another optimizer
-@pytest.mark.filterwarnings("ignore:load_path_or_dict:UserWarning")
-@pytest.mark.parametrize("algorithm", [A2C, PPO])
-def test_a_policy_moves_to_another_algorithm_and_back(algorithm: type[OnPolicyAlgorithm]) -> None:
-    model = REINFORCE("MlpPolicy", "CartPole-v1", seed=0)
-    other = algorithm("MlpPolicy", "CartPole-v1", seed=1, device="cpu")
-    other.set_parameters({"policy": model.get_parameters()["policy"]}, exact_match=False)
-    assert all(map(th.equal, other.policy.parameters(), model.policy.parameters()))
-    other.learn(1)
-    model.set_parameters(other.get_parameters(), exact_match=False)
-    assert all(map(th.equal, other.policy.parameters(), model.policy.parameters()))
-
-
 @pytest.mark.parametrize("ortho_init", [True, False])
 def test_the_bias_of_a_linear_policy_is_0(ortho_init: bool) -> None:
     policy = make(LinearPolicy, ortho_init=ortho_init)
@@ -113,4 +97,4 @@ def test_what_is_searched_is_read_in_evaluation_mode_and_the_mode_stays(mode):
     policy.set_training_mode(mode)
     parts = (policy.features_extractor, policy.mlp_extractor.policy_net, policy.action_net)
     expected = {parameter for part in parts for parameter in part.parameters()}
-    assert set(searched_parameters(policy)) == expected and policy.training == mode
+    assert set(parameters.searched_parameters(policy)) == expected and policy.training == mode

@@ -67,11 +67,11 @@ def sample(space, n):
     return stack([space.sample() for _ in range(n)])
 
 
-def perturbed(policy, k, scale=0.3):
+def perturbed(policy, k):
     actor = parameters.searched_parameters(policy)
     theta = parameters.read(actor)
     generator = th.Generator().manual_seed(0)
-    return actor, theta + scale * th.randn(k, len(theta), dtype=th.float64, generator=generator)
+    return actor, theta + 0.3 * th.randn(k, len(theta), dtype=th.float64, generator=generator)
 
 
 def check_side_by_side_is_one_by_one(policy, expected=None):

@@ -14,26 +14,26 @@ from sb3_reinforce.sampling.recurrent_actors import LstmActor, RecurrentPolicyAc
 ACTIONS = [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2,))]
 
 
-def recorded(actor, n_steps=200, n_envs=3):
+def recorded(actor):
     """Actions, log π and states over random observations and starts of episodes."""
     rng = np.random.default_rng(0)
     th.manual_seed(1)
-    obs = rng.normal(size=(n_steps, n_envs, 5)).astype(np.float32)
-    starts = rng.random((n_steps, n_envs)) < 0.1
+    obs = rng.normal(size=(200, 3, 5)).astype(np.float32)
+    starts = rng.random((200, 3)) < 0.1
     actions, states, log_probs = [], [], []
-    for t in range(n_steps):
+    for t in range(200):
         actor.starts = lambda t=t: starts[t]
         action, _, log_prob = actor.act(obs[t])
         actions.append(action)
         log_probs.append(log_prob)
         states.append(actor.state())
     if log_probs[0] is None:
-        log_probs = actor.log_prob(np.array(actions).reshape(n_steps, n_envs, -1))
+        log_probs = actor.log_prob(np.array(actions).reshape(200, 3, -1))
     return obs, starts, np.array(actions), th.stack(states), np.ravel(log_probs)
 
 
-def corridor(space, n_envs=3):
-    return make_vec_env(lambda: Corridor((5, 3), lambda t, action: float(np.sum(action)), space), n_envs, seed=0)
+def corridor(space):
+    return make_vec_env(lambda: Corridor((5, 3), lambda t, action: float(np.sum(action)), space), 3, seed=0)
 
 
 @pytest.mark.parametrize("space", ACTIONS, ids=str)

@@ -2,20 +2,19 @@
 
 import csv
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import TORCHRUN
 
 from sb3_reinforce import REINFORCE
 
-LAUNCHER = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 COMPARE = Path(__file__).parents[2] / "examples/benchmarks/compare.py"
 
 
 @pytest.mark.slow
 def test_train_in_two_processes_writes_one_folder(tmp_path):
-    train = [*LAUNCHER, "-m", "sb3_reinforce.zoo", "train", "--algo", "reinforce", "--env", "CartPole-v1"]
+    train = [*TORCHRUN, "-m", "sb3_reinforce.zoo", "train", "--algo", "reinforce", "--env", "CartPole-v1"]
     train += ["-n", "2000", "--eval-freq", "500", "-f", tmp_path / "logs"]
     done = subprocess.run(train, check=True, capture_output=True, text=True)
     assert done.stdout.count("Saving to") == 1
@@ -28,7 +27,7 @@ def test_train_in_two_processes_writes_one_folder(tmp_path):
 @pytest.mark.slow
 def test_compare_in_two_processes_writes_each_row_once(tmp_path):
     options = ["--tasks", "CartPole-v1", "--algorithms", "reinforce", "a2c", "--seeds", "0", "--timesteps", "1000"]
-    compare = [*LAUNCHER, COMPARE, *options, "--final-episodes", "5", "--output", tmp_path / "rows.csv"]
+    compare = [*TORCHRUN, COMPARE, *options, "--final-episodes", "5", "--output", tmp_path / "rows.csv"]
     subprocess.run(compare, check=True, capture_output=True)
     rows = list(csv.DictReader((tmp_path / "rows.csv").open()))
     assert [row["algorithm"] for row in rows if row["evaluation"] == "final"] == ["reinforce", "a2c"]
