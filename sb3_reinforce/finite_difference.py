@@ -248,11 +248,12 @@ class FiniteDifference(BasePolicyGradient):
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        # Before the counters are reset
+        self._check_arguments()
         tb_log_name = type(self).__name__ if tb_log_name is None else tb_log_name
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._check_arguments()
         n = self.n_parameters
         if self.estimator == "regression" and cast(int, self.n_delta) <= n:
             warnings.warn(

@@ -317,10 +317,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         n_steps = self.n_steps
-        env_before = self.env
+        model_env = self.env
         callback.on_rollout_start()
-        if self.env is not env_before:
-            env = cast(VecEnv, self.env)
+        if self.env is not model_env:
+            env = model_env = cast(VecEnv, self.env)
         # The user or a callback may have changed arguments
         check_reinforce(self)
         check_starts(self)
@@ -360,9 +360,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             raise
         finally:
             self.is_collecting = False
-            if not is_collected or has_given_seeds(env):
-                # The environments stopped in the middle of episodes, or may draw the same random numbers: they are
-                # reset before they are used again
+            if not is_collected or self.env is not model_env or has_given_seeds(env):
+                # The environments stopped in the middle of episodes, are others than in this rollout, or may draw the
+                # same random numbers: they are reset before they are used
                 self._last_obs = None
         # A process that has sent its part to process 0 has no rollout
         if columns is None or self.rollout is None:
@@ -555,6 +555,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if not th.is_grad_enabled():
             raise ValueError("learn needs gradients, and PyTorch's are turned off: call th.set_grad_enabled(True)")
+        # Before the counters are reset
+        check_reinforce(self)
+        check_starts(self)
         tb_log_name = type(self).__name__ if tb_log_name is None else tb_log_name
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 

@@ -1,5 +1,6 @@
 """What is trained is read from the policy at each step, also from one that was replaced, frozen or changed."""
 
+import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
@@ -293,6 +294,19 @@ def test_environments_that_a_callback_sets_at_the_start_of_a_rollout_are_used_in
     used = Record(lambda model: (used.locals["env"] is model.env, model.env is other), "step")
     make(kind, env).learn(100, [switch, used])
     assert all(is_own for is_own, _ in used.records) and used.records[-1] == (True, True)
+
+
+@pytest.mark.parametrize("kind", ["steps", "episodes", "memory"])
+def test_environments_that_a_callback_sets_within_a_rollout_are_reset_before_the_next(kind):
+    """The timesteps of a rollout, and the observations that they are."""
+    env, other = (make_vec_env(lambda: Corridor((5,)), 2) for _ in range(2))
+    other.reset()
+    other.step(np.zeros(2, dtype=int))
+    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=8, device="cpu") if kind == "memory" else make(kind, env)
+    met = Record(lambda model: (model.rollout.timesteps, model.rollout.observations.argmax(-1)))
+    model.learn(60, [At(3, lambda model: model.set_env(other)), met])
+    assert model.env is other and len(met.records) > 2
+    assert all(timesteps.equal(obs) for timesteps, obs in met.records)
 
 
 def test_the_logged_loss_of_the_critic_is_the_mean_over_its_minibatches():

@@ -108,8 +108,8 @@ USED_BEFORE = {
 )
 @pytest.mark.parametrize("at", ["before", "rollout_start"])
 def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name, at):
-    model = make(kind)
-    before = deepcopy(model.get_parameters())
+    model = make(kind).learn(16)
+    before, n_steps = deepcopy(model.get_parameters()), model.num_timesteps
     for value in wrong_values(name, TABLES[type(model)][name]):
         given = getattr(model, name)
         change = Record(lambda model, value=value: setattr(model, name, value), "rollout_start")
@@ -117,6 +117,7 @@ def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name, 
             setattr(model, name, value)
         with pytest.raises((TypeError, ValueError), match=name):
             model.learn(64, callback=change)
+        assert model.num_timesteps == (n_steps if at == "before" else 0)
         setattr(model, name, given)
     assert plain(model.get_parameters()) == plain(before)
 
