@@ -89,7 +89,11 @@ PERTURBATIONS: dict[str, Perturbation] = {
 
 def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, generator: th.Generator) -> th.Tensor:
     """``Δ = delta_std · δ``, shape ``(k, n)``; the directions δ, which a user's function may draw, are checked."""
-    return delta_std * check_tensor("perturbation", perturbation(k, n, generator), (k, n))
+    deltas = check_tensor("perturbation", perturbation(k, n, generator), (k, n))
+    # A few signs are often all equal, and leave the regression no direction. The moments of δ stay the same
+    while k > 1 and perturbation in (rademacher, sphere) and (deltas == deltas[0]).all():
+        deltas = perturbation(k, n, generator)
+    return delta_std * deltas
 
 
 # Beyond this, more updates with rougher gradients cost less

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_reinforce.estimation import PERTURBATIONS, coordinate, gaussian, rademacher, sphere
-from sb3_reinforce.estimation.perturbations import default_n_delta
+from sb3_reinforce.estimation.perturbations import default_n_delta, sample_deltas
 
 
 def generator(seed=0):
@@ -35,6 +35,17 @@ def test_norms():
         norms = perturbation(9, 6, generator()).norm(dim=1)
         th.testing.assert_close(norms, th.full((9,), 6**0.5).double())
     assert set(rademacher(9, 6, generator()).unique().tolist()) == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize(("perturbation", "n"), [(sphere, 1), (rademacher, 1), (rademacher, 2)])
+def test_a_few_signs_are_not_all_equal_and_still_have_the_moments(perturbation, n):
+    """The regression would have no direction, with half of all pairs of signs."""
+    draws = [sample_deltas(perturbation, 2, n, 0.5, source) for source in map(generator, range(2000))]
+    assert all((deltas[0] != deltas[1]).any() for deltas in draws)
+    # Standard errors of a mean of k independent signs, of 0.5; the two rows of a draw are not
+    rows = th.stack([deltas[0] for deltas in draws])
+    th.testing.assert_close(rows.mean(0), th.zeros(n).double(), rtol=0, atol=5 * 0.5 * 2000**-0.5)
+    th.testing.assert_close(4 * rows.T @ rows / 2000, th.eye(n).double(), rtol=0, atol=5 * 2000**-0.5)
 
 
 def test_a_few_coordinates_of_many_take_little_memory():
