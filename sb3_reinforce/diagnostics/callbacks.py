@@ -20,6 +20,10 @@ from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import first_step, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
+from sb3_reinforce.policies.parameters import evaluation_mode
+
+# Characters of a baseline's name that the log of Stable-Baselines3 shows if it has to cut it
+N_SHOWN = 21
 
 
 class Diagnosis(BaseCallback):
@@ -94,6 +98,11 @@ class GradientQualityCallback(Diagnosis):
         if not isinstance(self.model, FiniteDifference):
             check_model(self.model, independent=True)
             self.functions = functions_of(self.model, self.baselines)
+            if len({name[:N_SHOWN] for name in self.functions}) < len(self.functions):
+                raise ValueError(
+                    f"baselines must have names that differ in their first {N_SHOWN} characters, the only ones that "
+                    f"the log shows of longer names, got {', '.join(self.functions)}"
+                )
 
     def _forget(self) -> None:
         """Start with a model of which nothing is known."""
@@ -221,9 +230,11 @@ class PitfallCallback(Diagnosis):
         """What is known of the last update, which was computed from this rollout."""
         logged = self.logger.name_to_value
         returns = rollout.returns[rollout.used]
+        with evaluation_mode(rollout.policy):
+            noise = randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan))
         return Update(
             kl=logged.get("train/kl", math.nan),
-            randomness=randomness(rollout.policy, self.obs, -logged.get("train/entropy_loss", math.nan)),
+            randomness=noise,
             grad_norm=logged.get("train/grad_norm", math.nan),
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,

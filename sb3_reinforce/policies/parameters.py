@@ -1,18 +1,30 @@
 """θ, the parameters of a policy's actor, as one vector of float64, which holds every float32 exactly."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from gymnasium.vector.utils import create_empty_array
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph
+
+
+@contextmanager
+def evaluation_mode(policy: BasePolicy) -> Iterator[None]:
+    """Put a policy in evaluation mode in the block; restore its mode."""
+    training = policy.training
+    policy.set_training_mode(False)
+    try:
+        yield
+    finally:
+        policy.set_training_mode(training)
 
 
 def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -23,14 +35,9 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     obs = obs_as_tensor(observation_in(policy.observation_space), policy.device)
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
-    training = policy.training
-    policy.set_training_mode(False)
-    try:
-        with th.enable_grad():
-            parameters = actor_parameters(policy, obs, actions)
+    with evaluation_mode(policy), th.enable_grad():
+        parameters = actor_parameters(policy, obs, actions)
         leave_no_graph(policy, obs, actions)
-    finally:
-        policy.set_training_mode(training)
     log_std = getattr(policy, "log_std", None)
     searched = [parameter for parameter in parameters if parameter is not log_std]
     if not searched:
