@@ -7,6 +7,7 @@ the end of episodes have no seed. Without seeds an environment whose episode end
 """
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -16,7 +17,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.envs.checks import check_finite
-from sb3_reinforce.envs.starts import start_episodes
+from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 from sb3_reinforce.sampling.normalization import original_reward_of
 
@@ -114,6 +115,13 @@ def evaluate_candidates(
         starts = None if seeds is None else np.array([seeds[pair] for pair in tracker.pairs])
         obs = start_episodes(env, starts)
         check_finite("The observation", obs, (None,))
+        if starts is not None and not are_alike(obs, starts):
+            warnings.warn(
+                "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
+                "another reset, the observations differ. Let the environment draw all random numbers from "
+                "self.np_random, or set common_random_numbers=False",
+                stacklevel=2,
+            )
         started = list(range(len(tracker.pairs)))
         while tracker.active.any():
             if started:

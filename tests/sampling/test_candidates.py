@@ -215,6 +215,21 @@ def test_pending_seeds_do_not_keep_candidates_from_sharing_a_start(name):
     assert np.array_equal(first, second) and (first == first[0]).all()
 
 
+class OwnGenerator(Counting):
+    """Draws from a generator that its seed does not reach."""
+
+    np_random = np.random.default_rng(0)
+
+
+def test_environments_that_do_not_start_alike_from_equal_seeds_are_named():
+    seeds = np.array([[7], [7], [8]])
+    with pytest.warns(UserWarning, match="Common random numbers do not reduce the noise"):
+        evaluate(DummyVecEnv([OwnGenerator] * 3), [2] * 3, seeds)
+    # No two of a round have the same seed
+    evaluate(DummyVecEnv([OwnGenerator] * 2), [2] * 2, seeds[1:])
+    evaluate(DummyVecEnv([OwnGenerator] * 3), [2] * 3)
+
+
 def test_large_finite_numbers_are_no_error():
     class Large(Counting):
         def step(self, action):
