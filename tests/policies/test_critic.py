@@ -139,6 +139,21 @@ def test_only_an_extractor_that_does_not_move_is_kept(share):
     assert modes[-3:] == [True] * 3 if not share else modes[-4:] == [True, False, False, False]
 
 
+class CommonLayer(ActorCriticPolicy):
+    """Actor and critic have a layer with batch normalization in common, behind their features."""
+
+    def _build_mlp_extractor(self):
+        super()._build_mlp_extractor()
+        layers = self.mlp_extractor.policy_net
+        self.mlp_extractor.value_net = layers.append(th.nn.BatchNorm1d(self.mlp_extractor.latent_dim_pi))
+
+
+def test_the_critics_passes_leave_the_statistics_of_a_common_layer_alone():
+    few, many = (make(CommonLayer, n_critic_updates=n).learn(1).policy.mlp_extractor for n in (1, 5))
+    assert th.equal(few.policy_net[-1].running_mean, many.policy_net[-1].running_mean)
+    assert few.policy_net[-1].running_mean.any()
+
+
 @both_policies
 def test_values_of_the_policy_step_are_those_of_predict_values(policy):
     """Also if the user overrides it and the extractor is shared."""
