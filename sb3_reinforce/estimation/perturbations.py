@@ -26,18 +26,21 @@ def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
     """
     One parameter at a time: ``δ = ± e_j``.
 
-    Each pass over the parameters is in a new random order; the first pass has the sign +, the second −, and so on, so
-    that ``2 n`` rows are the central differences of all parameters.
+    Each pass over the parameters is in a new random order. The signs of the first pass are random, and each further
+    pass has the opposite ones, so that ``2 n`` rows are the central differences of all parameters. With equal signs the
+    intercept of the regression would take the mean of the measured components.
 
     :param k: Number of perturbations
     :param n: Number of parameters
     :param generator: Source of randomness
     :return: Shape ``(k, n)``, every row a unit vector
     """
+    signs = rademacher(1, n, generator)
     deltas = []
     for first in range(0, k, n):
-        rows = th.nn.functional.one_hot(th.randperm(n, generator=generator)[: k - first], n).double()
-        deltas.append(rows if (first // n) % 2 == 0 else -rows)
+        rows = th.nn.functional.one_hot(th.randperm(n, generator=generator)[: k - first], n)
+        deltas.append(signs * rows)
+        signs = -signs
     return th.cat(deltas)
 
 

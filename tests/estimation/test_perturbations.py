@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_reinforce.estimation import PERTURBATIONS, coordinate, gaussian, rademacher, sphere
+from sb3_reinforce.estimation import PERTURBATIONS, coordinate, gaussian, rademacher, regression_gradient, sphere
 from sb3_reinforce.estimation.perturbations import default_n_delta, sample_deltas
 
 
@@ -55,13 +55,22 @@ def test_a_few_coordinates_of_many_take_little_memory():
 
 def test_coordinates_visit_all_parameters_with_alternating_sign():
     deltas = coordinate(10, 4, generator())
-    for rows, sign in ((deltas[:4], 1), (deltas[4:8], -1)):
-        th.testing.assert_close(rows.abs().sum(0), th.ones(4).double())
-        assert (rows.sum(1) == sign).all()
     assert th.equal(deltas.abs().sum(1), th.ones(10).double())
-    assert (deltas[8:].sum(1) == 1).all()
+    signs = deltas[:4].sum(0)
+    assert signs.abs().tolist() == [1, 1, 1, 1] and deltas[4:8].sum(0).equal(-signs)
+    assert (deltas[8:] * signs).sum(1).tolist() == [1, 1]
     first, second, third = coordinate(60, 20, generator()).abs().argmax(1).split(20)
     assert first.tolist() != second.tolist() != third.tolist()
+
+
+@pytest.mark.parametrize("k", [2, 4])
+def test_a_regression_on_a_few_coordinates_expects_a_multiple_of_the_gradient(k):
+    """``ĝ_i = g_i − s_i (s · g) / k`` of the k measured coordinates of n, with random signs s of mean 0."""
+    n, gradient = 4, th.tensor([3.0, 2.0, 4.0, 1.0]).double()
+    draws = (coordinate(k, n, source) for source in map(generator, range(4000)))
+    estimates = th.stack([regression_gradient(lambda x: x @ gradient, th.zeros(n).double(), each) for each in draws])
+    difference = estimates.mean(0) - k / n * (1 - 1 / k) * gradient
+    assert (difference.abs() < 5 * estimates.std(0) / len(estimates) ** 0.5).all()
 
 
 @pytest.mark.parametrize(("k", "n"), [(10, 5), (64, 42), (21, 43), (64, 300)])
