@@ -86,7 +86,8 @@ class FiniteDifference(BasePolicyGradient):
         (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
     :param n_eval_episodes: Episodes per candidate, whose utility is their mean return
     :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
-        the start from differences, but environments idle until the longest episode of a round ends
+        the start from differences, but environments that wait for the longest episode of a round go on: their steps
+        are counted and not used
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
     :param standardize_utilities: Divide the gradient by the standard deviation of all utilities (ARS: of those that
         ``n_top`` leaves) and multiply it by ``delta_std``: the step then depends neither on the scale of the rewards

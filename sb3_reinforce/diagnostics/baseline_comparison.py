@@ -87,7 +87,7 @@ def compare_baselines(
         "variance": "trace of the covariance of the gradient of one episode",
         "ratio": f"variance / variance of {reference!r}, on the same resamples",
         "snr": "squared norm of the expected gradient / variance; an interval that includes 0: no signal detected",
-        "bias": "relative to the gradient, where it is known in theory",
+        "bias": "relative to the gradient of 'none', where it is known in theory",
         "seconds": "time to compute the baseline",
         "[a, b]": f"{confidence:.0%} bootstrap interval; -: not known",
     }
