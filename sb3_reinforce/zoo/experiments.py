@@ -14,6 +14,7 @@ from rl_zoo3 import exp_manager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_reinforce.common.processes import is_leader
 from sb3_reinforce.zoo.settings import (
     ALGORITHMS,
     LINEAR,
@@ -71,6 +72,12 @@ class Experiment(exp_manager.ExperimentManager):
             if is_unsupported or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """Train as the Zoo does, with callbacks in process 0 only: the Zoo ends the first of them itself."""
+        if not is_leader():
+            self.callbacks = []
+        super().learn(model)
 
     def read_hyperparameters(self) -> tuple[Settings, Settings]:
         """Return the settings, checked, and a sorted copy, which the Zoo writes beside the model."""
