@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.tensors import select, take, to_vector
+from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
@@ -164,8 +164,8 @@ class PitfallCallback(Diagnosis):
 
     The pitfalls: a learning rate that is too large, returns that are not scaled, too few episodes, the total return,
     gradients that spike without clipping, a critic that explains nothing, a policy that is deterministic too early, and
-    episodes that are cut. They are detected from what training computes anyway; the cost is a forward and a backward
-    pass of the actor over each rollout, and a forward pass over at most 256 steps. Training is not changed.
+    episodes that are cut. They are detected from what training computes anyway; the cost is two forward passes and a
+    backward pass of the actor over each rollout. Training is not changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
 
@@ -173,8 +173,7 @@ class PitfallCallback(Diagnosis):
     :raises TypeError: If the model is not a REINFORCE
     """
 
-    # Steps at which the randomness is measured, and components of a gradient that are kept
-    N_STEPS = 256
+    # Components of a gradient that are kept
     N_COMPONENTS = 10_000
 
     def _init_callback(self) -> None:
@@ -193,7 +192,7 @@ class PitfallCallback(Diagnosis):
         self.rollout = rollout
         policy = rollout.policy
         obs, actions = used_inputs(rollout)
-        self.obs = take(obs, th.arange(min(len(actions), self.N_STEPS)))
+        self.obs = obs
         self.temperature = temperature_of(policy)
         log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)

@@ -283,6 +283,5 @@ def test_the_gradient_is_that_of_all_steps(rollout):
     model = REINFORCE("MlpPolicy", env, learning_rate=0.0, max_grad_norm=None, **kwargs)
     callback = PitfallCallback()
     model.learn(1, callback)
-    assert model.rollout.used.sum() > 2 * callback.N_STEPS
     norm = float(callback.gradient.norm()) / model.rollout.denominator
     assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-4)

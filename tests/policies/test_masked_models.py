@@ -109,6 +109,25 @@ def test_a_policy_that_has_no_choice_is_not_called_deterministic():
     assert "deterministic_too_early" not in callback.found
 
 
+class Early(Masked):
+    """Has a choice in the first steps of an episode only."""
+
+    def observe(self):
+        obs = super().observe()
+        self.parts[0][:] = self.t < 20
+        self.parts[0][0] = True
+        return obs
+
+
+@pytest.mark.filterwarnings("ignore:The returns")
+@pytest.mark.parametrize("algorithm", ["reinforce", "recurrent"])
+def test_the_randomness_of_a_nearly_uniform_policy_is_near_one_whenever_it_has_a_choice(algorithm):
+    env = make_vec_env(lambda: ActionMaskObservation(Early(*TASKS["discrete"], lengths=(400,))), 2, seed=0)
+    callback = PitfallCallback()
+    make(algorithm, env, n_steps=400, learning_rate=1e-6).learn(1600, callback)
+    assert [update.randomness for update in callback.updates] == pytest.approx([1.0, 1.0], abs=0.02)
+
+
 @pytest.mark.parametrize("algorithm", [*ALGORITHMS])
 @pytest.mark.parametrize("space", [spaces.MultiBinary(3), spaces.Box(-1, 1, (2,))])
 def test_only_discrete_actions_can_be_masked(space, algorithm):
