@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
 
-# Options of ``train`` that change the result, and their names in ``args.yml``
+# Options of ``train`` that change the result, and their names in ``args.yml``; ``enjoy`` needs some of them
 OPTIONS = {
     "--algo": "algo",
     "--env": "env",
@@ -27,6 +27,7 @@ OPTIONS = {
     "--gym-packages": "gym_packages",
     "--trained-agent": "trained_agent",
 }
+OF_ENJOY = ("algo", "env", "log_folder", "gym_packages")
 
 CLASS = re.compile(r"<class ('[\w.]+')>")
 
@@ -42,7 +43,7 @@ Mean reward of {n_episodes} deterministic episodes, after training with seed {se
 ## Usage (with the RL Zoo)
 
 ```sh
-python -m sb3_reinforce.zoo enjoy --algo {name} --env {env} -f {folder}
+{usage}
 ```
 
 ## Training
@@ -84,25 +85,24 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Pa
     path = Path(run, "README.md")
     card = CARD.format(
         algorithm=type(agent).__name__,
-        command=training_command(arguments),
+        command=zoo_command("train", arguments),
         env=env_id,
-        folder=folder,
         mean=mean,
         n_episodes=n_episodes,
-        name=name,
         seed=arguments["seed"],
         settings=yaml.dump(settings),
         std=std,
+        usage=zoo_command("enjoy", {each: arguments[each] for each in OF_ENJOY}),
     )
     path.write_text(card)
     return path
 
 
-def training_command(arguments: dict[str, Any]) -> str:
-    """``train`` with the arguments that the Zoo has saved, as far as they change the result."""
-    command = ["python", "-m", "sb3_reinforce.zoo", "train"]
-    for option, name in OPTIONS.items():
-        value = arguments.get(name)
+def zoo_command(name: str, arguments: dict[str, Any]) -> str:
+    """A command of the Zoo with the arguments that it has saved, as far as they change the result."""
+    command = ["python", "-m", "sb3_reinforce.zoo", name]
+    for option, argument in OPTIONS.items():
+        value = arguments.get(argument)
         if isinstance(value, dict):
             # The Zoo finds a class by its path
             value = [f"{key}:" + CLASS.sub(r"get_class_by_name(\1)", repr(part)) for key, part in value.items()]

@@ -51,7 +51,7 @@ def load_configuration(config: str) -> Any:
         if config.endswith((".yml", ".yaml")):
             return yaml.safe_load(Path(config).read_text())
         names = runpy.run_path(config) if config.endswith(".py") else vars(importlib.import_module(config))
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, SyntaxError, yaml.YAMLError) as error:
         raise ConfigurationError(f"{config} cannot be read: {error}") from error
     if "hyperparams" not in names:
         raise ConfigurationError(f"{config} must define a dict named hyperparams")

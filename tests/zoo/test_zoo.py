@@ -107,7 +107,8 @@ def test_record_video_also_of_an_environment_of_another_package(name, tmp_path, 
     zoo("record_video", *common, "-o", str(tmp_path / "videos"))
     gym.registry.pop("Own-v0")
     monkeypatch.delitem(sys.modules, "own_envs")
-    assert "--gym-packages own_envs" in write_card(str(tmp_path), name, "Own-v0", n_episodes=2).read_text()
+    card = write_card(str(tmp_path), name, "Own-v0", n_episodes=2).read_text()
+    assert all(re.search(f"zoo {command} .*--gym-packages own_envs", card) for command in ("train", "enjoy"))
     gym.registry.pop("Own-v0")
     assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 
@@ -295,6 +296,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         ([*REINFORCE, "--env", "Blackjack-v1"], "observation_space must be Box, Discrete, MultiDiscrete, "),
         ([*REINFORCE, "--device", "gpu9"], "device must be 'auto' or a device that PyTorch knows, got 'gpu9'"),
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
+        ([*REINFORCE, "--conf-file", "broken.py"], "broken.py cannot be read: '{' was never closed"),
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
@@ -304,6 +306,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
 )
 def test_a_wrong_command_is_answered_with_a_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    Path("broken.py").write_text("hyperparams = {")
     assert sentence in message_of(capsys, *arguments)
 
 
