@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -115,7 +116,8 @@ class Random(Corridor):
         truncate: bool = True,
     ):
         super().__init__(lengths, lambda t, action: self.draw_reward(), action_space, truncate)
-        self.observation_space = observation_space
+        # Other environments may have the same space, and each draws its random numbers alone
+        self.observation_space = deepcopy(observation_space)
         self.n_steps = self.n_episodes = 0
 
     def draw_reward(self) -> float:

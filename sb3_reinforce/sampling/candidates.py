@@ -119,7 +119,7 @@ def evaluate_candidates(
             warnings.warn(
                 "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
                 "another reset, the observations differ. Let the environment draw all random numbers from "
-                "self.np_random, or set common_random_numbers=False",
+                "self.np_random, or give FiniteDifference common_random_numbers=False",
                 stacklevel=2,
             )
         started = list(range(len(tracker.pairs)))
