@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
@@ -22,7 +23,7 @@ from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
 from sb3_reinforce.policies.parameters import evaluation_mode
 
-# Characters of a baseline's name that the log of Stable-Baselines3 shows if it has to cut it
+# The printed log cuts a baseline's name to so many characters and three dots, if it is longer than both together
 N_SHOWN = 21
 
 
@@ -77,7 +78,7 @@ class GradientQualityCallback(Diagnosis):
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
-        lacks, or if the model's episodes are not independent because they share the noise of gSDE
+        lacks, if the printed log would cut two names to the same one, or if the model's episodes share gSDE's noise
     """
 
     def __init__(
@@ -98,10 +99,12 @@ class GradientQualityCallback(Diagnosis):
         if not isinstance(self.model, FiniteDifference):
             check_model(self.model, independent=True)
             self.functions = functions_of(self.model, self.baselines)
-            if len({name[:N_SHOWN] for name in self.functions}) < len(self.functions):
+            shown = {name if len(name) <= N_SHOWN + 3 else name[:N_SHOWN] for name in self.functions}
+            is_printed = any(isinstance(each, HumanOutputFormat) for each in self.logger.output_formats)
+            if is_printed and len(shown) < len(self.functions):
+                names = ", ".join(self.functions)
                 raise ValueError(
-                    f"baselines must have names that differ in their first {N_SHOWN} characters, the only ones that "
-                    f"the log shows of longer names, got {', '.join(self.functions)}"
+                    f"baselines must have names that differ in their first {N_SHOWN} characters, got {names}"
                 )
 
     def _forget(self) -> None:

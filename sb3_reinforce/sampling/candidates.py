@@ -16,6 +16,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_reinforce.common.tensors import map_parts, take
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
@@ -108,6 +109,8 @@ def evaluate_candidates(
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
         env.reset()
+    # The first observation of each seed
+    met: dict[int, Any] = {}
     queue = [(candidate, episode) for episode in range(n_episodes) for candidate in range(len(thetas))]
     size = max(1, len(queue)) if seeds is None else env.num_envs
     for first in range(0, len(queue), size):
@@ -115,13 +118,8 @@ def evaluate_candidates(
         starts = None if seeds is None else np.array([seeds[pair] for pair in tracker.pairs])
         obs = start_episodes(env, starts)
         check_finite("The observation", obs, (None,))
-        if starts is not None and not are_alike(obs, starts):
-            warnings.warn(
-                "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
-                "another reset, the observations differ. Let the environment draw all random numbers from "
-                "self.np_random, or give FiniteDifference common_random_numbers=False",
-                stacklevel=2,
-            )
+        if starts is not None:
+            compare_with_earlier(met, starts, obs)
         started = list(range(len(tracker.pairs)))
         while tracker.active.any():
             if started:
@@ -136,3 +134,18 @@ def evaluate_candidates(
             if finished.any():
                 started = tracker.finish(finished, returns)
     return returns
+
+
+def compare_with_earlier(met: dict[int, Any], seeds: np.ndarray, obs: Any) -> None:
+    """Warn where an episode starts with another observation than the first one of its seed, which ``met`` keeps."""
+    for env, seed in enumerate(seeds.tolist()):
+        # By a list, which copies: some VecEnvs reuse the array
+        one = take(obs, [env])
+        if not are_alike(map_parts(lambda *parts: np.concatenate(parts), met.setdefault(seed, one), one), size=2):
+            warnings.warn(
+                "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
+                "another reset, the observations differ. Let the environment draw all random numbers from "
+                "self.np_random, or give FiniteDifference common_random_numbers=False",
+                stacklevel=3,
+            )
+            return

@@ -298,7 +298,7 @@ def test_environments_that_a_callback_sets_at_the_start_of_a_rollout_are_used_in
 
 @pytest.mark.parametrize("kind", ["steps", "episodes", "memory"])
 def test_environments_that_a_callback_sets_within_a_rollout_are_reset_before_the_next(kind):
-    """The timesteps of a rollout, and the observations that they are."""
+    """The observation of a Corridor is its timestep, so the two are equal after a reset."""
     env, other = (make_vec_env(lambda: Corridor((5,)), 2) for _ in range(2))
     other.reset()
     other.step(np.zeros(2, dtype=int))

@@ -223,9 +223,11 @@ class OwnGenerator(Counting):
 
 def test_environments_that_do_not_start_alike_from_equal_seeds_are_named():
     seeds = np.array([[7], [7], [8]])
-    with pytest.warns(UserWarning, match="Common random numbers do not reduce the noise"):
-        evaluate(DummyVecEnv([OwnGenerator] * 3), [2] * 3, seeds)
-    # No two of a round have the same seed
+    # With one environment in two rounds
+    for n_envs in (1, 3):
+        with pytest.warns(UserWarning, match="Common random numbers do not reduce the noise"):
+            evaluate(DummyVecEnv([OwnGenerator] * n_envs), [2] * 3, seeds)
+    # No two have the same seed
     evaluate(DummyVecEnv([OwnGenerator] * 2), [2] * 2, seeds[1:])
     evaluate(DummyVecEnv([OwnGenerator] * 3), [2] * 3)
 
