@@ -126,17 +126,17 @@ def baseline_rows(
         begin = time.perf_counter()
         weights[name] = weights_by(function, rollout)
         seconds[name] = time.perf_counter() - begin
-    moments = {name: compute_moments(products, counts) for name, products in gram_matrices(rollout, weights).items()}
+    found = {name: compute_moments(products, counts) for name, products in gram_matrices(rollout, weights).items()}
     return [
         BaselineRow(
             baseline=name,
-            variance=interval(variance(of), confidence),
-            ratio=interval(variance(of) / variance(moments[reference]), confidence),
-            snr=UNKNOWN if name == "floor" else interval(signal_to_noise(of), confidence),
+            variance=interval(variance(moments), confidence),
+            ratio=interval(variance(moments) / variance(found[reference]), confidence),
+            snr=UNKNOWN if name == "floor" else interval(signal_to_noise(moments), confidence),
             bias=float("nan") if name == "floor" else relative_bias(functions[name], rollout),
             seconds=seconds[name],
         )
-        for name, of in moments.items()
+        for name, moments in found.items()
     ]
 
 

@@ -151,8 +151,7 @@ class GradientQualityCallback(Diagnosis):
         rollout = evenly_spread(rollout, self.max_episodes)
         weights = [own_weights, *(weights_by(function, rollout) for function in self.functions.values())]
         grams = sum(th.stack([gram(g) for g in block]) for block in gradient_blocks(rollout, *weights))
-        every_episode = th.ones(1, min(n_episodes, self.max_episodes), dtype=th.float64)
-        own, *others = (compute_moments(each, every_episode) for each in cast(th.Tensor, grams))
+        own, *others = map(compute_moments, cast(th.Tensor, grams))
         figures = {"snr": n_episodes * float(signal_to_noise(own)), "noise_scale": float(noise_scale(own))}
         for name, moments in zip(self.functions, others, strict=True):
             figures[f"variance/{name}"] = float(variance(moments))

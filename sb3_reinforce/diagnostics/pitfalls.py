@@ -123,8 +123,7 @@ def too_few_episodes(history: History) -> str | None:
     is_large = n_episodes >= 8 if history.model.n_steps is None else n_steps >= 64
     if len(gradients) < 50 or not is_comparable or is_large:
         return None
-    matrix = gram(th.stack(gradients))
-    ratio = float(signal_to_noise(compute_moments(matrix, th.ones(1, len(matrix), dtype=th.float64))))
+    ratio = float(signal_to_noise(compute_moments(gram(th.stack(gradients)))))
     if ratio < 0.1 or math.isnan(ratio):
         argument = "n_episodes" if history.model.n_steps is None else "n_steps, or the number of environments"
         shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"

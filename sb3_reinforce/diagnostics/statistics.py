@@ -28,39 +28,41 @@ def gram(gradients: th.Tensor, others: th.Tensor | None = None) -> th.Tensor:
     return (g @ h.T).cpu()
 
 
-def compute_moments(gram: th.Tensor, counts: th.Tensor) -> Moments:
+def compute_moments(products: th.Tensor, counts: th.Tensor | None = None) -> Moments:
     """
     ``E‖g‖² ≈ Σ_{i≠j} c_i c_j K_ii / Σ_{i≠j} c_i c_j`` and ``‖E g‖² ≈ Σ_{i≠j} c_i c_j K_ij / Σ_{i≠j} c_i c_j`` for
-    ``gram`` (m, m) and ``counts`` (r, m).
+    ``products`` K (m, m) and ``counts`` (r, m), by default each sample once.
 
     A pair of a sample with itself, or with its copy in a resample, would count noise as signal (Hoeffding, 1948, on
     U-statistics). Over the same pairs, the difference of the two is half the mean of ``‖g_i − g_j‖²``, never negative.
     """
-    diagonal = gram.diagonal()
+    if counts is None:
+        counts = products.new_ones(1, len(products))
+    diagonal = products.diagonal()
     total = counts.sum(1)
     n_pairs = total.square() - counts.square().sum(1)
     second = (counts @ diagonal) * total - counts.square() @ diagonal
-    signal = ((counts @ gram) * counts).sum(1) - counts.square() @ diagonal
+    signal = ((counts @ products) * counts).sum(1) - counts.square() @ diagonal
     return Moments(second / n_pairs, signal / n_pairs)
 
 
-def variance(of: Moments) -> th.Tensor:
+def variance(moments: Moments) -> th.Tensor:
     """``tr Σ = E‖g‖² − ‖E g‖²``, unbiased: the trace of the sample covariance with denominator m − 1."""
     # Rounding can leave a difference below 0 if all samples are equal
-    return (of.second - of.signal).clamp(min=0)
+    return (moments.second - moments.signal).clamp(min=0)
 
 
-def signal_to_noise(of: Moments) -> th.Tensor:
+def signal_to_noise(moments: Moments) -> th.Tensor:
     """``SNR = ‖E g‖² / tr Σ`` (Roberts and Tedrake, 2009), consistent; negative if no signal is detected."""
-    return of.signal / variance(of)
+    return moments.signal / variance(moments)
 
 
-def noise_scale(of: Moments) -> th.Tensor:
+def noise_scale(moments: Moments) -> th.Tensor:
     """``B = tr Σ / ‖E g‖²`` (McCandlish et al., 2018, equation 2.9 and appendix A.1), infinite if no signal is seen."""
-    return th.where(of.signal > 0, variance(of) / of.signal, th.inf)
+    return th.where(moments.signal > 0, variance(moments) / moments.signal, th.inf)
 
 
-def cosine(of: Moments, reference: Moments, products: th.Tensor, confidence: float) -> Estimate:
+def cosine(moments: Moments, reference: Moments, products: th.Tensor, confidence: float) -> Estimate:
     """
     ``cos = ⟨E g, E r⟩ / (‖E g‖ ‖E r‖)`` with products ``⟨E g, E r⟩`` (1 + r,), NaN if no signal is detected.
 
@@ -68,10 +70,10 @@ def cosine(of: Moments, reference: Moments, products: th.Tensor, confidence: flo
     about ``√(1 + B / m)`` at noise scale B. Where 0 is in the interval of ``‖E g‖²`` or ``‖E r‖²`` the direction is
     unknown, and the interval is [−1, 1].
     """
-    squares = of.signal.clamp(min=0) * reference.signal.clamp(min=0)
+    squares = moments.signal.clamp(min=0) * reference.signal.clamp(min=0)
     found = interval((products / squares.sqrt()).clamp(-1, 1), confidence)
     value = found.value if squares[0] > 0 else float("nan")
-    if min(interval(side.signal, confidence).low for side in (of, reference)) > 0:
+    if min(interval(side.signal, confidence).low for side in (moments, reference)) > 0:
         return Estimate(value, found.low, found.high)
     return Estimate(value, -1.0, 1.0)
 
