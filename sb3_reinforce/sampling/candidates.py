@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_reinforce.common.tensors import map_parts, take
+from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
@@ -141,7 +141,7 @@ def compare_with_earlier(met: dict[int, Any], seeds: np.ndarray, obs: Any) -> No
     for env, seed in enumerate(seeds.tolist()):
         # By a list, which copies: some VecEnvs reuse the array
         one = take(obs, [env])
-        if not are_alike(map_parts(lambda *parts: np.concatenate(parts), met.setdefault(seed, one), one), size=2):
+        if not are_alike(stack([met.setdefault(seed, one), one]), size=2):
             warnings.warn(
                 "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
                 "another reset, the observations differ. Let the environment draw all random numbers from "
