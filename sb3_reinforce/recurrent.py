@@ -72,6 +72,7 @@ class RecurrentREINFORCE(REINFORCE):
         "MaskedLstmPolicy": MaskedLstmPolicy,
     }
     prefers_episodes = True
+    policy: RecurrentPolicy
 
     def __init__(
         self,
@@ -150,7 +151,7 @@ class RecurrentREINFORCE(REINFORCE):
         self._are_whole = are_whole
 
     def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
-        policy = cast(RecurrentPolicy, self.policy)
+        policy = self.policy
         check_sequence_methods(type(policy), vars(policy).keys())
         if self._actor is not None:
             # A callback has changed the policy during the rollout
@@ -166,7 +167,7 @@ class RecurrentREINFORCE(REINFORCE):
 
     def _state_after_rollout(self) -> th.Tensor:
         """The states at the cut; the critic's are computed from the rollout, in process 0 for the columns of all."""
-        policy = cast(RecurrentPolicy, self.policy)
+        policy = self.policy
         rollout = self.rollout
         state = policy.zero_state(self.n_envs if rollout is None else rollout.dones.shape[1])
         state[: self.n_envs, 0] = cast(RecurrentActor, self._actor).state()
@@ -177,7 +178,7 @@ class RecurrentREINFORCE(REINFORCE):
     @th.no_grad()
     def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
-        policy = cast(RecurrentPolicy, self.policy)
+        policy = self.policy
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
         if state is not None and self._next_state is not None:
             goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
