@@ -168,8 +168,8 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
         reseed(env_of(model), np.random.randint(2**31))
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
-    wanted = {id(parameter) for parameter in searched_parameters(rollout.policy)}
-    mask = th.cat([th.full((parameter.numel(),), id(parameter) in wanted) for parameter in parameters_of(rollout)])
+    wanted = {*searched_parameters(rollout.policy)}
+    mask = th.cat([th.full((parameter.numel(),), parameter in wanted) for parameter in parameters_of(rollout)])
     return gradients[:, mask], rollout.dones.numel()
 
 

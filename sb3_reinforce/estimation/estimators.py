@@ -168,7 +168,7 @@ def fit_quality(
     # Both products have the rank of x; the smaller one is cheaper
     product = x @ x.T if len(x) < len(gradient) else x.T @ x
     rank = int(th.linalg.matrix_rank(product, hermitian=True))
-    n_columns = int((columns.bincount() > 0).sum())
+    n_columns = len(th.unique(columns))
     degrees_of_freedom = len(y) - n_columns - rank
     squares = float(residuals @ residuals)
     total = float(y @ y)

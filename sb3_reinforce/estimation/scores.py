@@ -116,10 +116,10 @@ def sums_by_backward_passes(
         yield number, th.stack([*map(to_vector, gradients)])
 
 
-def steps_of(episode: th.Tensor) -> Iterator[th.Tensor]:
+def steps_of(episode: th.Tensor) -> tuple[th.Tensor, ...]:
     """The steps of each episode, in the order of the episodes' numbers."""
     lengths = th.unique(episode, return_counts=True)[1]
-    return iter(th.split(episode.argsort(stable=True), lengths.tolist()))
+    return th.split(episode.argsort(stable=True), lengths.tolist())
 
 
 def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
@@ -151,7 +151,7 @@ def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     if layers is None:
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    if len({id(parameter) for parameter in parameters}) < len(parameters):
+    if len(set(parameters)) < len(parameters):
         return None
     if isinstance(policy.action_dist, DiagGaussianDistribution):
         log_std = policy.log_std
