@@ -17,12 +17,7 @@ from sb3_reinforce.common.arguments import check_function, choose
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import (
-    FINITE_DIFFERENCE_ARGUMENTS,
-    check_finite_difference,
-    check_learn,
-    check_named,
-)
+from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn, check_named
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,

@@ -11,13 +11,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_reinforce.common import storage
-from sb3_reinforce.common.arguments import (
-    Check,
-    CheckedSchedule,
-    check_device,
-    check_flag,
-    own_arguments,
-)
+from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device, check_flag, own_arguments
 from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader, rank_and_size
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name

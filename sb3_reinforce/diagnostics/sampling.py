@@ -93,8 +93,7 @@ def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent:
     if independent and model.use_sde and model.sde_sample_freq != 1:
         raise ValueError(
             f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, so they "
-            "are not independent samples. Measure a model with sde_sample_freq=1, or "
-            "without use_sde"
+            "are not independent samples. Measure a model with sde_sample_freq=1, or without use_sde"
         )
     env_of(model)
 

@@ -10,13 +10,7 @@ from torch import nn
 
 from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.evaluation import route_of
-from sb3_reinforce.policies.plain_mlp import (
-    has_numpy_form,
-    is_unchanged,
-    linear_operation,
-    plain_actor,
-    takes_vectors,
-)
+from sb3_reinforce.policies.plain_mlp import has_numpy_form, is_unchanged, linear_operation, plain_actor, takes_vectors
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
 
