@@ -79,6 +79,13 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     return solve(design, utilities - utilities.mean())
 
 
+ESTIMATORS: dict[str, Estimator] = {
+    "regression": regression_gradient,
+    "central": central_difference,
+    "forward": forward_difference,
+}
+
+
 def check_deltas(theta: th.Tensor, deltas: Any) -> th.Tensor:
     """Return finite perturbations, rows like θ, in its precision."""
     if not isinstance(deltas, th.Tensor):
@@ -186,13 +193,6 @@ def centred(x: th.Tensor, columns: th.Tensor) -> th.Tensor:
     counts = columns.bincount()
     sums = x.new_zeros(len(counts), x.shape[1]).index_add_(0, columns, x)
     return x - (sums / counts[:, None])[columns]
-
-
-ESTIMATORS: dict[str, Estimator] = {
-    "regression": regression_gradient,
-    "central": central_difference,
-    "forward": forward_difference,
-}
 
 
 def check_candidates(must: str, candidates: Any, n_parameters: int) -> th.Tensor:

@@ -16,46 +16,10 @@ from sb3_reinforce.estimation.estimators import check_tensor
 # (k, n, generator) -> deltas of shape (k, n), float64
 Perturbation: TypeAlias = Callable[[int, int, th.Generator], th.Tensor]
 
-
-def new_generator() -> th.Generator:
-    """A separate generator, seeded by PyTorch's global one."""
-    return th.Generator().manual_seed(int(th.randint(2**31, ())))
-
-
-def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
-    """
-    One parameter at a time: ``δ = ± e_j``.
-
-    Each pass over the parameters is in a new random order. The signs of the first pass are random, and each further
-    pass has the opposite ones, so that ``2 n`` rows are the central differences of all parameters. With equal signs the
-    intercept of the regression would take the mean of the measured components.
-
-    :param k: Number of perturbations
-    :param n: Number of parameters
-    :param generator: Source of randomness
-    :return: Shape ``(k, n)``, every row a unit vector
-    """
-    signs = rademacher(1, n, generator)
-    deltas = []
-    for first in range(0, k, n):
-        rows = th.nn.functional.one_hot(th.randperm(n, generator=generator)[: k - first], n)
-        deltas.append(signs * rows)
-        signs = -signs
-    return th.cat(deltas)
-
-
-def sphere(k: int, n: int, generator: th.Generator) -> th.Tensor:
-    """
-    Uniform on the sphere of radius √n: ``δ = √n z / ‖z‖`` with ``z ~ N(0, I)``.
-
-    :param k: Number of perturbations
-    :param n: Number of parameters
-    :param generator: Source of randomness
-    :return: Shape ``(k, n)``, every row of norm √n
-    """
-    deltas = gaussian(k, n, generator)
-    norms: th.Tensor = th.linalg.vector_norm(deltas, dim=1, keepdim=True)
-    return math.sqrt(n) * deltas / norms
+# Beyond this, more updates with rougher gradients cost less
+MAX_DEFAULT_N_DELTA = 64
+# The utility of a policy near zero does not tell smaller perturbations from none
+MIN_DEFAULT_DELTA_STD = 0.05
 
 
 def gaussian(k: int, n: int, generator: th.Generator) -> th.Tensor:
@@ -82,12 +46,53 @@ def rademacher(k: int, n: int, generator: th.Generator) -> th.Tensor:
     return 2 * th.randint(2, (k, n), generator=generator).double() - 1
 
 
+def sphere(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    Uniform on the sphere of radius √n: ``δ = √n z / ‖z‖`` with ``z ~ N(0, I)``.
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``, every row of norm √n
+    """
+    deltas = gaussian(k, n, generator)
+    norms: th.Tensor = th.linalg.vector_norm(deltas, dim=1, keepdim=True)
+    return math.sqrt(n) * deltas / norms
+
+
+def coordinate(k: int, n: int, generator: th.Generator) -> th.Tensor:
+    """
+    One parameter at a time: ``δ = ± e_j``.
+
+    Each pass over the parameters is in a new random order. The signs of the first pass are random, and each further
+    pass has the opposite ones, so that ``2 n`` rows are the central differences of all parameters. With equal signs the
+    intercept of the regression would take the mean of the measured components.
+
+    :param k: Number of perturbations
+    :param n: Number of parameters
+    :param generator: Source of randomness
+    :return: Shape ``(k, n)``, every row a unit vector
+    """
+    signs = rademacher(1, n, generator)
+    deltas = []
+    for first in range(0, k, n):
+        rows = th.nn.functional.one_hot(th.randperm(n, generator=generator)[: k - first], n)
+        deltas.append(signs * rows)
+        signs = -signs
+    return th.cat(deltas)
+
+
 PERTURBATIONS: dict[str, Perturbation] = {
     "coordinate": coordinate,
     "gaussian": gaussian,
     "rademacher": rademacher,
     "sphere": sphere,
 }
+
+
+def new_generator() -> th.Generator:
+    """A separate generator, seeded by PyTorch's global one."""
+    return th.Generator().manual_seed(int(th.randint(2**31, ())))
 
 
 def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, generator: th.Generator) -> th.Tensor:
@@ -98,12 +103,6 @@ def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, 
     while k > 1 and perturbation in (rademacher, sphere) and (deltas == deltas[0]).all():
         deltas = perturbation(k, n, generator)
     return delta_std * deltas
-
-
-# Beyond this, more updates with rougher gradients cost less
-MAX_DEFAULT_N_DELTA = 64
-# The utility of a policy near zero does not tell smaller perturbations from none
-MIN_DEFAULT_DELTA_STD = 0.05
 
 
 def default_n_delta(n_parameters: int, estimator: object, perturbation: object) -> int:
