@@ -40,7 +40,7 @@ class RecurrentPolicyActor(PolicyActor):
 
     def is_current(self, policy: Any) -> bool:
         """Whether the policy would still act as this actor does."""
-        return policy is self.policy and make_head(policy) is None
+        return policy is self.policy and numpy_head(policy) is None
 
 
 class LstmActor(NumpyActor):
@@ -104,13 +104,13 @@ def make_recurrent_actor(
     policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool
 ) -> RecurrentActor:
     """The fastest actor that acts as the policy would."""
-    layers = make_head(policy)
+    layers = numpy_head(policy)
     if layers is not None:
         return LstmActor(policy, layers, state, starts, with_log_prob)
     return RecurrentPolicyActor(policy, state, starts, with_log_prob)
 
 
-def make_head(policy: Any) -> list[nn.Module] | None:
+def numpy_head(policy: Any) -> list[nn.Module] | None:
     """The layers after an LSTM that NumPy can compute, or None."""
     layers = plain_actor(policy, RecurrentPolicy)
     lstm = policy.lstm_actor
