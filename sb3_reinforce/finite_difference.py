@@ -111,7 +111,7 @@ class FiniteDifference(BasePolicyGradient):
         "estimator": partial(check_named, functions=ESTIMATORS),
         "perturbation": partial(check_named, functions=PERTURBATIONS),
     }
-    _own_argument = "standardize_utilities"
+    _identifying_argument = "standardize_utilities"
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
     _maybe_recommend_cpu = cast(Any, OnPolicyAlgorithm._maybe_recommend_cpu)

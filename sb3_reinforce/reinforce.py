@@ -150,7 +150,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     #: Whether a rollout is by default whole episodes, also with a critic
     prefers_episodes: ClassVar[bool] = False
     _arguments = REINFORCE_ARGUMENTS | {"baseline": partial(check_named, functions=BASELINES)}
-    _own_argument = "reward_to_go"
+    _identifying_argument = "reward_to_go"
     _instead = INSTEAD_OF_PPO
 
     def __init__(

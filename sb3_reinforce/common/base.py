@@ -28,8 +28,8 @@ class BasePolicyGradient(Distributed):
 
     # The checks of the constructor's arguments, which also build the schedules
     _arguments: ClassVar[Mapping[str, Check]]
-    # One that no other algorithm saves
-    _own_argument: ClassVar[str]
+    # An argument that no other algorithm saves
+    _identifying_argument: ClassVar[str]
     # What to use for arguments of other algorithms
     _instead: ClassVar[Mapping[str, str]] = {}
     _random_state: bytes
@@ -163,7 +163,7 @@ class BasePolicyGradient(Distributed):
         check_device("device", device)
         check_flag("restore_random_state", restore_random_state)
         saved = storage.check_archive(path, ("data", "policy.pth"))
-        if cls._own_argument not in saved:
+        if cls._identifying_argument not in saved:
             raise ValueError(
                 f"{path} was not saved by a {cls.__name__}. If it has the same policy class, make a {cls.__name__} and "
                 "call set_parameters with this path and exact_match=False"

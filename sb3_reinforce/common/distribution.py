@@ -21,8 +21,8 @@ from sb3_reinforce.common.settings import ATTRIBUTES
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
 
-# The arguments that may differ between processes
-OWN_ARGUMENTS = {"verbose", "device", "tensorboard_log"}
+# The arguments that processes need not have in common
+MAY_DIFFER = {"verbose", "device", "tensorboard_log"}
 # All take over process 0's attributes of these types before they collect; with a ``_last_obs`` of None all reset
 SHARED = (bool, int, float, np.number, str, type(None), th.Generator)
 
@@ -68,7 +68,7 @@ class Distributed(BaseAlgorithm):
     def check_same(self) -> None:
         """Refuse processes that were started with different arguments."""
         own = {"algorithm": type(self).__name__, "n_envs": str(self.n_envs)}
-        for name in sorted(self._arguments.keys() - OWN_ARGUMENTS):
+        for name in sorted(self._arguments.keys() - MAY_DIFFER):
             value = getattr(self, ATTRIBUTES.get(name, name))
             # Without the address of a function
             own[name] = getattr(value, "__qualname__", repr(value) if isinstance(value, SHARED) else str(type(value)))
