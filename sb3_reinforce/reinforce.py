@@ -391,7 +391,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self, buffer: RolloutBuffer, columns: Columns, route: Route, baseline: Baseline, is_fixed: bool
     ) -> Rollout:
         """The rollout with the weights of its steps, which the buffer gets too."""
-        self._running = self._running.unless(buffer.episode_starts[0].astype(bool))
+        self._running = self._running.restarted(where=buffer.episode_starts[0].astype(bool))
         next_values = None
         if route.with_critic:
             buffer.values, next_values = self._evaluate_critic(route, buffer, columns)

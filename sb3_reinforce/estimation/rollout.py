@@ -106,11 +106,11 @@ class Running:
         """Every environment is at the start of an episode."""
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
-    def unless(self, starts: Bools) -> "Running":
-        """These episodes, and new ones where ``starts``, which must be True for added environments."""
-        timesteps = np.resize(self.timesteps, len(starts))
-        rewards = np.resize(self.rewards, len(starts))
-        return Running(np.where(starts, 0, timesteps), np.where(starts, 0.0, rewards))
+    def restarted(self, where: Bools) -> "Running":
+        """These episodes, and new ones ``where`` an episode starts, as it must in every added environment."""
+        timesteps = np.resize(self.timesteps, len(where))
+        rewards = np.resize(self.rewards, len(where))
+        return Running(np.where(where, 0, timesteps), np.where(where, 0.0, rewards))
 
     def after(self, rewards: Floats, dones: Bools, gamma: float) -> "Running":
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
