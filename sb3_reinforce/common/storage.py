@@ -162,13 +162,13 @@ def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: boo
     return not (missing or others)
 
 
-def load_optimizer(part: th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
+def load_optimizer(optimizer: th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
     """Load the state of an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
-    reason = optimizer_mismatch(part, state)
-    needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
+    reason = optimizer_mismatch(optimizer, state)
+    needed = f"load_path_or_dict[{name!r}] must be the state of {type(optimizer).__name__} for this policy"
     if not reason:
         # Copies, or two models that one dict is given to would share their moments
-        part.load_state_dict(deepcopy(dict(state)))
+        optimizer.load_state_dict(deepcopy(dict(state)))
     elif exact_match:
         raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
     else:

@@ -54,7 +54,7 @@ def time_mean(rollout: Rollout) -> th.Tensor:
     :param rollout: The rollout
     :return: b_t
     """
-    totals, counts = _by_timestep(rollout)
+    totals, counts = sums_by_timestep(rollout)
     return totals / counts.clamp(min=1)
 
 
@@ -68,7 +68,7 @@ def leave_one_out(rollout: Rollout) -> th.Tensor:
     :param rollout: The rollout
     :return: b_t
     """
-    totals, counts = _by_timestep(rollout)
+    totals, counts = sums_by_timestep(rollout)
     return (totals - rollout.returns) * rollout.used / (counts - 1).clamp(min=1)
 
 
@@ -113,7 +113,7 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
     # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖², with the mean c of G in the group: in float32 equal returns c would have a
     # baseline that differs from c
-    totals, counts = _sums_at(rollout.groups, rollout)
+    totals, counts = sums_at(rollout.groups, rollout)
     level = totals / counts.clamp(min=1)
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)
     n_parameters = sum(parameter.numel() for parameter in rollout.policy.parameters())
@@ -136,13 +136,13 @@ def sum_of_others(x: th.Tensor) -> th.Tensor:
     return before + after
 
 
-def _by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+def sums_by_timestep(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """The sum of G_t over the group's used steps of the same t, and their number; each ``(n_steps, n_envs)``."""
     place = rollout.timesteps + rollout.groups * (rollout.timesteps.max() + 1)
-    return _sums_at(th.unique(place, return_inverse=True)[1], rollout)
+    return sums_at(th.unique(place, return_inverse=True)[1], rollout)
 
 
-def _sums_at(place: th.Tensor, rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
+def sums_at(place: th.Tensor, rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """The sum of G_t over the used steps of the same place, and their number; each ``(n_steps, n_envs)``."""
     used = rollout.used.to(rollout.returns)
     zeros = used.new_zeros(int(place.max()) + 1)
