@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_reinforce.common import optimization
-from sb3_reinforce.common.arguments import check_function, choose
+from sb3_reinforce.common.arguments import check_function
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
@@ -191,7 +191,7 @@ class FiniteDifference(BasePolicyGradient):
         n_parameters = self.n_parameters
         if self.n_delta is None:
             n_delta = default_n_delta(n_parameters, self.estimator, self.perturbation)
-            choose(self, "n_delta", max(n_delta, self.n_top or 0))
+            self._choose("n_delta", max(n_delta, self.n_top or 0))
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators and the environments, and with a seed the perturbations too."""

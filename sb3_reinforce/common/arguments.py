@@ -136,12 +136,6 @@ def check_unless_none(name: str, value: Any, check: Check) -> Any:
     return None if value is None else check(name, value)
 
 
-def choose(model: Any, name: str, value: int) -> None:
-    """Set an argument that the user has left open."""
-    setattr(model, name, value)
-    model._chosen_defaults[name] = value
-
-
 def own_arguments(cls: type, base: type) -> dict[str, Parameter]:
     """The arguments of a class and of what it extends below ``base``, but for the environment and private ones."""
     classes = reversed(cls.__mro__[: cls.__mro__.index(base)])

@@ -84,6 +84,11 @@ class BasePolicyGradient(Distributed):
             self._schedules[name] = value
         return value
 
+    def _choose(self, name: str, value: int) -> None:
+        """Set an argument that the user has left open."""
+        setattr(self, name, value)
+        self._chosen_defaults[name] = value
+
     def _scheduled(self, name: str) -> float:
         """Return the present value of an argument that may be a schedule."""
         return float(self._checked(name)(self._current_progress_remaining))

@@ -23,7 +23,6 @@ from sb3_reinforce.common.arguments import (
     check_kind,
     check_number,
     check_subclass,
-    choose,
     optional,
     unknown_name,
 )
@@ -160,10 +159,10 @@ def check_reinforce(model: Any) -> None:
     check_noise(model.use_sde, model.action_space)
     if model.n_steps is None and model.n_episodes is None:
         if model.has_critic and not (model.shares_starts or model.prefers_episodes):
-            choose(model, "n_steps", 32)
+            model._choose("n_steps", 32)
         else:
             n_envs = model.n_envs * rank_and_size()[1]
-            choose(model, "n_episodes", n_envs if model.shares_starts else max(16, n_envs))
+            model._choose("n_episodes", n_envs if model.shares_starts else max(16, n_envs))
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
