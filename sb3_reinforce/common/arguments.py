@@ -22,7 +22,7 @@ ROUNDING = 1e-12
 
 
 def check_kind(name: str, value: Any, kinds: tuple[Any, ...], allowed: str = "") -> Any:
-    """Return an instance of one of some types; the error says in words what is ``allowed``, or names the types."""
+    """Return a value of one of the ``kinds``; the error says what is ``allowed``, or names the kinds."""
     # To Python True is a number
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         allowed = allowed or " or ".join(each.__name__ for each in kinds)
@@ -31,7 +31,7 @@ def check_kind(name: str, value: Any, kinds: tuple[Any, ...], allowed: str = "")
 
 
 def unknown_name(name: str, allowed: str, names: Iterable[str], value: Any) -> ValueError:
-    """Make the error for a name that is none of some, with the nearest one."""
+    """The error for an unknown name, with the known ones and the nearest of them."""
     known = {each.lower(): each for each in names}
     near = difflib.get_close_matches(str(value).lower(), known, n=1, cutoff=0.7)
     hint = f": did you mean {known[near[0]]!r}?" if near else ""
@@ -66,7 +66,7 @@ def check_flag(name: str, value: Any) -> bool:
 
 
 def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
-    """Return one of some names; the error lists them."""
+    """Return a name that is one of the choices; the error lists them."""
     if not isinstance(value, str) or value not in choices:
         raise unknown_name(name, "one of", choices, value)
     return value
@@ -137,7 +137,7 @@ def check_unless_none(name: str, value: Any, check: Check) -> Any:
 
 
 def own_arguments(cls: type, base: type) -> dict[str, Parameter]:
-    """The arguments of a class and of what it extends below ``base``, but for the environment and private ones."""
+    """The arguments of the constructors from ``cls`` up to but not including ``base``, without env and private ones."""
     classes = reversed(cls.__mro__[: cls.__mro__.index(base)])
     arguments = [each for one in classes for each in signature(one.__init__).parameters.values()]  # type: ignore[misc]
     variadic = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)

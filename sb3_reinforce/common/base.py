@@ -24,7 +24,7 @@ LOAD_ARGUMENTS = {"print_system_info", "force_reset"}
 
 
 class BasePolicyGradient(Distributed):
-    """What both algorithms have in common besides the mathematics: saving and loading change everything or nothing."""
+    """What both algorithms share besides the mathematics. Saving and loading change everything or nothing."""
 
     # The checks of the constructor's arguments, which also build the schedules
     _arguments: ClassVar[Mapping[str, Check]]

@@ -143,7 +143,7 @@ class Processes:
         return everything
 
     def finish(self, state: Any) -> None:
-        """End the work of the others, after their parts of a rollout that a callback has stopped."""
+        """Tell the others that learning has ended; parts of a rollout that a callback stopped are received first."""
         if self.in_round:
             self.receive()
         self.send(Finished(state))

@@ -142,7 +142,7 @@ ATTRIBUTES = {"policy": "policy_class", "stats_window_size": "_stats_window_size
 
 
 def check_attributes(model: Any) -> None:
-    """Check the arguments as the model has them now, and store each but schedules in Python's own type."""
+    """Check the arguments as the model has them now, and store all but schedules as Python's own types."""
     for name in model._arguments:
         value = model._checked(name)
         if not isinstance(value, CheckedSchedule):

@@ -25,7 +25,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 
 def guarded(learn: Learn) -> Learn:
-    """``learn`` with its model's environments guarded, and independent at its end; SIGTERM ends it as Ctrl-C does."""
+    """Guard the environments during ``learn``, and make them independent around it; SIGTERM ends it as Ctrl-C does."""
 
     @wraps(learn)
     def run(model: Any, /, *args: Any, **kwargs: Any) -> Any:

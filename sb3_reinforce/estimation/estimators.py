@@ -145,7 +145,7 @@ class Fit:
     :param residual_std: Standard deviation of what is left, in units of the utility; NaN without degrees of freedom
     :param standard_error: Standard error of each component of ĝ as a least-squares fit, shape ``(n,)``; None unless the
         evaluations determine every component and leave a degree of freedom. It is too small for forward
-        differences, which share the noise of U(θ), and without a meaning for ``n_top``, where ĝ is another fit
+        differences, which share the noise of U(θ), and meaningless with ``n_top``, where ĝ is another fit
     """
 
     r_squared: float

@@ -37,7 +37,7 @@ class ParameterGroups:
             self.of_critic.update(critic_parameters(policy, obs, actions))
             if policy.share_features_extractor:
                 self.of_actor.update(policy.features_extractor.parameters())
-        # These may act in training mode only, as the scale of a layer's noise; without a gradient they stay as they are
+        # They may count in training mode only, like the scale of a layer's noise; without a gradient they do not change
         others = set(parameters) - self.of_actor - self.of_critic
         only_critic = self.of_critic - self.of_actor
         actor = [each for each in parameters if each in self.of_actor | others]

@@ -75,7 +75,7 @@ def methods_of(cls: Any) -> frozenset[str]:
 
 
 def own_methods(cls: type, base: type) -> frozenset[str]:
-    """The methods of ``base`` that a class overrides; all of them if it is no subclass, as a compiled policy."""
+    """The methods of ``base`` that a class overrides; all of them if it is not a subclass, like a compiled one."""
     if base not in cls.__mro__:
         return methods_of(base)
     subclasses = cls.__mro__[: cls.__mro__.index(base)]

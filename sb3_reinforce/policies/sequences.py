@@ -47,7 +47,7 @@ class RecurrentPolicy(ActorCriticPolicy):
         super().__init__(*args, **kwargs)
         self.memory_arguments = {name: kwargs[name] for name in LSTM_ARGUMENTS if name in kwargs}
         self.memory_arguments |= {"memory": memory, "lstm_kwargs": lstm_kwargs}
-        # In the place of sb3-contrib's, which are LSTMs without arguments here
+        # Replace sb3-contrib's memories, which are LSTMs made without lstm_kwargs
         n_layers, _, n_hidden = self.lstm_hidden_state_shape
         for name in ("lstm_actor", "lstm_critic"):
             if getattr(self, name) is not None:

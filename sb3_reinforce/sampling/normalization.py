@@ -43,7 +43,7 @@ class ObservationStatistics:
         self.vec_normalize.training = False
 
     def thaw(self) -> None:
-        """Let the wrapper learn, unless a callback has set that it does not."""
+        """Let the wrapper learn again, unless a callback has turned its learning off."""
         self.vec_normalize.training = self.is_training
 
     def update(self) -> None:

@@ -32,7 +32,7 @@ from sb3_reinforce.zoo.settings import (
 )
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-# The policies that take Dict observations in the place of others
+# The policies that replace others where observations are dicts
 FOR_DICTS = dict.fromkeys(("MlpPolicy", "CnnPolicy", "LinearPolicy"), "MultiInputPolicy")
 FOR_DICTS |= dict.fromkeys(("MlpLstmPolicy", "CnnLstmPolicy"), "MultiInputLstmPolicy")
 
