@@ -1,7 +1,7 @@
 """Every baseline on the same episodes: which one leaves the least noise in the gradient of a task."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import cast
 
@@ -13,7 +13,7 @@ from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_t
 from sb3_reinforce.diagnostics.tables import UNKNOWN, Estimate, Table, interval, resample_counts
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import CHUNK, gradients_by_episode, parameters_of
+from sb3_reinforce.estimation.scores import gradient_blocks
 from sb3_reinforce.estimation.weights import returns_minus_baseline
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -167,14 +167,6 @@ def gram_matrices(rollout: Rollout, weights: dict[str, th.Tensor]) -> dict[str, 
             found[name] += gram(each)
         found["floor"] += gram(componentwise_residuals(gradients[0], scores))
     return found
-
-
-def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
-    """``gradients_by_episode`` in blocks ``(k, m, c)`` of c components of θ, at most ``floats`` numbers each."""
-    n_parameters = sum(parameter.numel() for parameter in parameters_of(rollout))
-    n_columns = max(1, floats // (len(weights) * len(rollout.used_episodes)))
-    for start in range(0, n_parameters, n_columns):
-        yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))
 
 
 def componentwise_residuals(weighted: th.Tensor, scores: th.Tensor) -> th.Tensor:

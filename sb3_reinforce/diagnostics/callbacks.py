@@ -12,13 +12,13 @@ from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
-from sb3_reinforce.diagnostics.baseline_comparison import functions_of, gradient_blocks, weights_by
+from sb3_reinforce.diagnostics.baseline_comparison import functions_of, weights_by
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
-from sb3_reinforce.estimation.scores import first_step, parameters_of
+from sb3_reinforce.estimation.scores import first_step, gradient_blocks, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
 from sb3_reinforce.policies.parameters import evaluation_mode

@@ -9,13 +9,12 @@ from torch.nn.utils.rnn import pad_sequence
 
 from sb3_reinforce.common.arguments import check_integer, check_number
 from sb3_reinforce.common.tensors import stack, take
-from sb3_reinforce.diagnostics.baseline_comparison import gradient_blocks
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resample_counts
 from sb3_reinforce.envs.starts import check_groups
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import CHUNK
+from sb3_reinforce.estimation.scores import CHUNK, gradient_blocks
 from sb3_reinforce.estimation.weights import without_rounding
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, start_from, undisturbed

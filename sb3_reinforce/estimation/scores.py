@@ -80,6 +80,14 @@ def gradients_by_episode(
     return result
 
 
+def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHUNK) -> Iterator[th.Tensor]:
+    """``gradients_by_episode`` in blocks ``(k, m, c)`` of c components of θ, at most ``floats`` numbers each."""
+    n_parameters = sum(parameter.numel() for parameter in parameters_of(rollout))
+    n_columns = max(1, floats // (len(weights) * len(rollout.used_episodes)))
+    for start in range(0, n_parameters, n_columns):
+        yield gradients_by_episode(rollout, *weights, columns=slice(start, start + n_columns))
+
+
 def sums_by_factors(
     rollout: Rollout, parameters: Parameters, layers: list[nn.Module], w: th.Tensor, episode: th.Tensor, chunk: int
 ) -> Iterator[tuple[int, th.Tensor]]:

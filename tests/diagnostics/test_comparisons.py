@@ -19,8 +19,9 @@ from sb3_reinforce.diagnostics import (
     gradients_by_episode,
     sample,
 )
-from sb3_reinforce.diagnostics.baseline_comparison import componentwise_residuals, gradient_blocks
+from sb3_reinforce.diagnostics.baseline_comparison import componentwise_residuals
 from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation.scores import gradient_blocks
 
 BOX = spaces.Box(-1, 1, (1,))
 
