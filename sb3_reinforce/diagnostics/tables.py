@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 
 import torch as th
 
-from sb3_reinforce.common.arguments import check_integer
+from sb3_reinforce.common.arguments import check_choice, check_integer
 
 Row = TypeVar("Row")
 
@@ -75,9 +75,7 @@ class Table(Generic[Row]):
         return name in self.names
 
     def __getitem__(self, name: str) -> Row:
-        if name not in self:
-            raise ValueError(f"{self.columns[0]} must be one of {', '.join(map(repr, self.names))}, got {name!r}")
-        return self.rows[self.names.index(name)]
+        return self.rows[self.names.index(check_choice(self.columns[0], name, tuple(self.names)))]
 
     def __iter__(self) -> Iterator[Row]:
         return iter(self.rows)
