@@ -214,7 +214,7 @@ class PitfallCallback(Diagnosis):
         """Add the update after the last rollout to the history, and warn of new pitfalls."""
         if self.rollout is None or not self.logger.name_to_value:
             return
-        self.updates.append(self._update(self.rollout))
+        self.updates.append(self._describe_update(self.rollout))
         self.n_updates += 1
         self.rollout = None
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.locals["total_timesteps"])
@@ -227,7 +227,7 @@ class PitfallCallback(Diagnosis):
                 warnings.warn(sentence, stacklevel=2)
 
     @th.no_grad()
-    def _update(self, rollout: Rollout) -> Update:
+    def _describe_update(self, rollout: Rollout) -> Update:
         """What is known of the last update, which was computed from this rollout."""
         logged = self.logger.name_to_value
         returns = rollout.returns[rollout.used]
