@@ -23,7 +23,7 @@ from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
 from sb3_reinforce.policies.parameters import evaluation_mode
 
-# The printed log cuts a baseline's name to so many characters and three dots, if it is longer than both together
+# The printed log shows names of up to 24 characters in full, and of longer ones this many and three dots
 N_SHOWN = 21
 
 

@@ -51,7 +51,7 @@ class History:
 Pitfall: TypeAlias = Callable[[History], str | None]
 
 
-def present(value: Any, history: History) -> float:
+def scheduled(value: Any, history: History) -> float:
     """The present value of an argument that may be a schedule."""
     return float(value(history.progress_remaining) if callable(value) else value)
 
@@ -61,8 +61,8 @@ def step_bound(history: History) -> tuple[str, float]:
     model = history.model
     if model.step == "natural":
         target_kl = DEFAULT_TARGET_KL if model.target_kl is None else model.target_kl
-        return "target_kl", present(target_kl, history)
-    return "learning_rate", present(model.lr_schedule, history)
+        return "target_kl", scheduled(target_kl, history)
+    return "learning_rate", scheduled(model.lr_schedule, history)
 
 
 def rate_too_large(history: History) -> str | None:
@@ -181,7 +181,7 @@ def deterministic_too_early(history: History) -> str | None:
         remedy = f"raise temperature (now {history.updates[-1].temperature:.2g})"
         if isinstance(history.model.action_space, spaces.Box):
             remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
-        ent_coef = present(history.model.ent_coef, history)
+        ent_coef = scheduled(history.model.ent_coef, history)
         return (
             f"With {left:.0%} of the training left the policy is all but deterministic ({share:.1%} of the randomness "
             f"that it could have), and its scores vanish. Raise ent_coef (now {ent_coef:.2g}), "

@@ -122,7 +122,7 @@ class MatrixActor:
         return apply_temperature(self.head, x)[:, 0]
 
 
-# Acts in environment i with the i-th of ``n_envs`` vectors of values of the searched parameters
+# Acts in environment i with the i-th of ``n_envs`` candidates
 CandidateActor: TypeAlias = LoopActor | MatrixActor
 
 
