@@ -22,6 +22,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.diagnostics import sample
 from sb3_reinforce.diagnostics.baseline_comparison import baseline_rows, compare_baselines, functions_of
 from sb3_reinforce.diagnostics.tables import resample_counts
+from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.policies.evaluation import log_prob_of
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -62,7 +63,7 @@ for timesteps in (0, arguments.timesteps):
     model = REINFORCE("MlpPolicy", env, seed=arguments.seed, device="cpu")
     if timesteps:
         model.learn(timesteps)
-    rollout, functions, counts = sample(model, 100), functions_of(model, None), resample_counts(100, 500, 0)
+    rollout, functions, counts = sample(model, 100), functions_of(BASELINES), resample_counts(100, 500, 0)
     ways = {
         "collecting the episodes alone": lambda model=model: sample(model, 100),
         "without collecting": lambda r=rollout, f=functions, c=counts: baseline_rows(r, f, "none", c, 0.95),

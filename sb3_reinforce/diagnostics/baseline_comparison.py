@@ -1,9 +1,9 @@
 """Every baseline on the same episodes: which one leaves the least noise in the gradient of a task."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import torch as th
 
@@ -75,10 +75,14 @@ def compare_baselines(
         share the noise of gSDE
     """
     check_model(model, independent=True)
-    functions = functions_of(model, baselines)
+    if baselines is None:
+        baselines = [name for name in BASELINES if name != "value" or model.has_critic]
+    functions = functions_of(baselines)
+    check_critic(model, functions)
     check_integer("n_episodes", n_episodes, 3)
     check_choice("reference", reference, tuple(functions))
     check_number("confidence", confidence, 0, 1)
+    seed = check_integer("seed", seed, 0)
     counts = resample_counts(n_episodes, n_resamples, seed)
     with seeded(model.policy, seed):
         rollout = sample(model, n_episodes, progress_bar=progress_bar)
@@ -95,25 +99,26 @@ def compare_baselines(
     return Table(title, rows, legend)
 
 
-def functions_of(model: REINFORCE, baselines: Iterable[str | Baseline] | None) -> dict[str, Baseline]:
-    """Check the baselines to compare, and return them by name, ``"none"`` first."""
-    if baselines is None:
-        baselines = [name for name in BASELINES if name != "value" or model.has_critic]
+def functions_of(baselines: Any) -> dict[str, Baseline]:
+    """Check names and functions of baselines, and return the functions by name, ``"none"`` first."""
     functions: dict[str, Baseline] = {"none": BASELINES["none"]}
-    if not isinstance(baselines, Iterable) or isinstance(baselines, str):
-        baselines = [cast(str | Baseline, baselines)]
-    for baseline in baselines:
+    is_single = isinstance(baselines, str) or not isinstance(baselines, Iterable)
+    for baseline in [baselines] if is_single else baselines:
         function = check_function("baselines", baseline, BASELINES)
-        if function is BASELINES["value"] and not model.has_critic:
-            raise ValueError(
-                f"baselines has 'value', but the model has no critic, as its baseline is {model.baseline!r}: leave "
-                "'value' out, or train a model with baseline='value'"
-            )
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
         if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(f"baselines must have names that differ, and {name!r} is the name of another row")
         functions[name] = function
     return functions
+
+
+def check_critic(model: REINFORCE, functions: Mapping[str, Baseline]) -> None:
+    """Refuse ``"value"`` for a model without a critic."""
+    if BASELINES["value"] in functions.values() and not model.has_critic:
+        raise ValueError(
+            f"baselines has 'value', but the model has no critic, as its baseline is {model.baseline!r}: leave "
+            "'value' out, or train a model with baseline='value'"
+        )
 
 
 def baseline_rows(

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, cast
 
 import torch as th
@@ -12,7 +12,7 @@ from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
-from sb3_reinforce.diagnostics.baseline_comparison import functions_of, weights_by
+from sb3_reinforce.diagnostics.baseline_comparison import check_critic, functions_of, weights_by
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
@@ -91,14 +91,13 @@ class GradientQualityCallback(Diagnosis):
         super().__init__(verbose)
         self.every = check_integer("every", every, 1)
         self.max_episodes = check_integer("max_episodes", max_episodes, 2)
-        # An iterator would be empty at the second call of learn
-        self.baselines = list(baselines) if isinstance(baselines, Iterator) else baselines
+        self.functions = functions_of(baselines)
 
     def _init_callback(self) -> None:
         super()._init_callback()
         if not isinstance(self.model, FiniteDifference):
             check_model(self.model, independent=True)
-            self.functions = functions_of(self.model, self.baselines)
+            check_critic(self.model, self.functions)
             shown = {name if len(name) <= N_SHOWN + 3 else name[:N_SHOWN] for name in self.functions}
             is_printed = any(isinstance(each, HumanOutputFormat) for each in self.logger.output_formats)
             if is_printed and len(shown) < len(self.functions):

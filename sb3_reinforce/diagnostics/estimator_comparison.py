@@ -8,7 +8,14 @@ from functools import partial
 import numpy as np
 import torch as th
 
-from sb3_reinforce.common.arguments import check_choice, check_function, check_integer, check_number, check_unless_none
+from sb3_reinforce.common.arguments import (
+    check_choice,
+    check_function,
+    check_integer,
+    check_kind,
+    check_number,
+    check_unless_none,
+)
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, cosine, gram, signal_to_noise
@@ -93,14 +100,16 @@ def compare_estimators(
         episodes are not independent because they share the noise of gSDE
     """
     check_model(model, (REINFORCE, FiniteDifference), independent=True)
+    check_kind("estimators", estimators, (Iterable,), "names")
     names = (estimators,) if isinstance(estimators, str) else tuple(estimators)
-    if not names:
-        raise ValueError("estimators must have at least one name")
     for name in names:
         check_choice("estimators", name, (LIKELIHOOD_RATIO, *ESTIMATORS))
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"estimators must have at least one name, and each of them once, got {names}")
     check_integer("n_episodes", n_episodes, 3)
     check_integer("n_estimates", n_estimates, 3)
     check_integer("n_resamples", n_resamples, 1)
+    seed = check_integer("seed", seed, 0)
     check_number("confidence", confidence, 0, 1)
     check_unless_none("n_delta", n_delta, partial(check_integer, low=2))
     check_unless_none("delta_std", delta_std, partial(check_number, low=0, above=True))

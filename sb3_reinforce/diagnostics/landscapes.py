@@ -107,8 +107,8 @@ def landscape(
 
     :param model: A model with an actor-critic policy; it is not changed. The environments are reset, so A2C and PPO
         must not be measured in ``on_step``
-    :param gradients: Gradients of the actor's parameters to draw, by name, each of shape ``(n,)``, or ``(m, n)`` for
-        several estimates of one gradient
+    :param gradients: Gradients of the actor's parameters without ``log_std`` to draw, by name, each of shape ``(n,)``,
+        or ``(m, n)`` for several estimates of one gradient
     :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,
         normalized filter by filter (Li et al., 2018, section 4)
     :param extent: Half the width of the plane, in multiples of the directions
@@ -122,6 +122,7 @@ def landscape(
     """
     check_number("extent", extent, 0, above=True)
     check_integer("n_points", n_points, 2)
+    seed = check_integer("seed", seed, 0)
     utility = CandidateUtility(model, n_episodes, seed)
     n = len(utility.theta)
     if not utility.theta.any():

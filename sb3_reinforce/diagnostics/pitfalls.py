@@ -197,7 +197,9 @@ def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
     if isinstance(space, spaces.Box):
         # Not train/std, which with gSDE is a standard deviation of weights
         std = float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
-        return min(1.0, std / float((space.high - space.low).mean() / 2))
+        # A squashed policy acts on [-1, 1], whatever the space
+        half_width = 1.0 if policy.squash_output else float((space.high - space.low).mean() / 2)
+        return min(1.0, std / half_width)
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
         # Of a policy that prefers none of the actions that a mask allows

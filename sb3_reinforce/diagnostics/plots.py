@@ -59,9 +59,10 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     :param table: The result of ``compare_baselines``
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
-    :raises TypeError: If ``table`` is no table
+    :raises TypeError: If ``table`` is not the result of ``compare_baselines``
     """
     check_kind("table", table, (Table,))
+    check_kind("table's first row", table.rows[0], (BaselineRow,), "a BaselineRow of compare_baselines")
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]
     for y, row in enumerate(rows):

@@ -55,8 +55,8 @@ def compare_starts(
     Measure whether groups of episodes that share their start would reduce the variance of the gradient.
 
     The model's policy plays eight episodes from each start, with the model's γ. What the environment draws after the
-    start is shared too, and counts as part of it. Where all returns are equal, nothing is known, and all figures are
-    NaN. With few starts the intervals are too narrow. For images, it takes several passes over the episodes.
+    start is shared too, and counts as part of it. Where all returns are equal, nothing is known, and the share is NaN.
+    With few starts the intervals are too narrow. For images, it takes several passes over the episodes.
 
     :param model: The model; it is not changed. Its environments get new seeds, and are left at the start of an episode
     :param n_starts: Number of starts, at least 4; rounded up until the environments play equal numbers of episodes
@@ -74,6 +74,7 @@ def compare_starts(
     step = env.num_envs // math.gcd(env.num_envs, N_PER_START)
     n_starts = math.ceil(check_integer("n_starts", n_starts, 4) / step) * step
     check_number("confidence", confidence, 0, 1)
+    seed = check_integer("seed", seed, 0)
     counts = resample_counts(n_starts, n_resamples, seed)
     with seeded(model.policy, seed):
         rollouts = sample_starts(model, n_starts, progress_bar)

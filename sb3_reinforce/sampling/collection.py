@@ -60,8 +60,8 @@ class Extent:
         """Refuse an episode that never ends."""
         if n_steps == self.deadline:
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and whole "
-                "episodes are waited for: give the environment a time limit, raise max_episode_steps, or set n_steps"
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and whole episodes "
+                "are waited for: give the environment a time limit, raise max_episode_steps, or, to train, set n_steps"
             )
 
     def count(self, dones: Bools, n_steps: int) -> list[int]:

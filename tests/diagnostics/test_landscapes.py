@@ -18,7 +18,7 @@ from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, estimator_comparison, landscape, plots
 from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
-from sb3_reinforce.diagnostics.tables import Estimate
+from sb3_reinforce.diagnostics.tables import Estimate, Table
 
 
 def bandit(algorithm=REINFORCE, **kwargs):
@@ -286,6 +286,7 @@ UNDRAWN = [np.ones((1, 8)), np.ones((3, 7)), np.ones(8)]
     ("plot", "arguments", "named"),
     [
         (plots.plot_baselines, (3,), "table must be Table, got 3"),
+        (plots.plot_baselines, (Table("", [Estimate(0.0, 0.0, 0.0)], {}),), "BaselineRow of compare_baselines"),
         (plots.plot_landscape, (3,), "scape must be Landscape, got 3"),
         (plots.plot_learning_curves, ([1], [1]), "runs must be a dictionary"),
         (plots.plot_learning_curves, ({}, [1]), "runs must have at least one array"),

@@ -218,6 +218,8 @@ MISTAKES = {
         ({"n_delta": 1}, "n_delta must be at least 2"),
         ({"estimators": "backward"}, "estimators must be one of.*'backward'"),
         ({"estimators": ()}, "estimators must have at least one name"),
+        ({"estimators": ("forward", "forward")}, r"each of them once, got \('forward', 'forward'\)"),
+        ({"estimators": 3}, "estimators must be names, got 3"),
         ({"perturbation": "cube"}, "perturbation must be"),
         ({"confidence": 95}, "confidence"),
         WRONG_BAR,
@@ -287,9 +289,10 @@ def test_a_seed_makes_figures_reproducible(training):
 
     generator = th.get_rng_state()
     first = figures(3)
-    np.testing.assert_equal(figures(3), first)
+    np.testing.assert_equal(figures(np.int64(3)), first)
     assert figures(4)[0]["snr_per_step"] != first[0]["snr_per_step"]
-    np.testing.assert_equal(*[landscape(model, n_points=2, seed=1).utilities for _ in range(2)])
-    compare_baselines(model, 5, n_resamples=2)
+    np.testing.assert_equal(*[landscape(model, n_points=2, seed=seed).utilities for seed in (1, np.int64(1))])
+    compare_baselines(model, 5, n_resamples=2, seed=np.int64(0))
+    compare_starts(model, 4, n_resamples=2, seed=np.int64(0))
     assert th.equal(th.get_rng_state(), generator)
     assert model.policy.training == training

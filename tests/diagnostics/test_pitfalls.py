@@ -211,6 +211,18 @@ def test_noise_wider_than_the_actions_is_all_the_randomness_there_is():
 
 
 @th.no_grad()
+def test_a_squashed_policy_is_as_random_on_a_wide_box_as_on_a_narrow_one():
+    """It acts on [-1, 1], and only the environment gets actions of the width of the space."""
+    squashed = {"use_sde": True, "policy_kwargs": {"squash_output": True, "log_std_init": -2.0}}
+    found = []
+    for width in (0.01, 1.0, 100.0):
+        space = spaces.Box(-width, width, (1,))
+        policy = REINFORCE("MlpPolicy", Corridor(action_space=space), seed=0, device="cpu", **squashed).policy
+        found.append(randomness(policy, th.ones(1, *policy.observation_space.shape), entropy=0.0))
+    assert found == [found[0]] * 3 and 0 < found[0] < 1
+
+
+@th.no_grad()
 @pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 5]), spaces.MultiBinary(3)], ids=str)
 def test_a_uniform_policy_is_all_random(space):
     policy = REINFORCE("MlpPolicy", Corridor(action_space=space), device="cpu").policy

@@ -137,6 +137,15 @@ def average(name):
 
 
 @pytest.mark.parametrize(
+    ("baselines", "message"),
+    [("timemean", "did you mean 'time_mean'"), ([3], "a name or a callable"), ((average("none"),), "another row")],
+)
+def test_wrong_baselines_are_refused_before_learn_resets_its_counters(baselines, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        GradientQualityCallback(1, baselines)
+
+
+@pytest.mark.parametrize(
     ("names", "verbose", "is_refused"),
     [
         (("average_over_long_episodes_1", "average_over_long_episodes_2"), 1, True),
