@@ -17,7 +17,13 @@ from sb3_reinforce.common.arguments import check_function
 from sb3_reinforce.common.base import BasePolicyGradient
 from sb3_reinforce.common.distribution import together
 from sb3_reinforce.common.interruptions import uninterrupted
-from sb3_reinforce.common.settings import FINITE_DIFFERENCE_ARGUMENTS, check_finite_difference, check_learn, check_named
+from sb3_reinforce.common.settings import (
+    FINITE_DIFFERENCE_ARGUMENTS,
+    INSTEAD_OF_ON_POLICY,
+    check_finite_difference,
+    check_learn,
+    check_named,
+)
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
@@ -112,6 +118,7 @@ class FiniteDifference(BasePolicyGradient):
         "perturbation": partial(check_named, functions=PERTURBATIONS),
     }
     _identifying_argument = "standardize_utilities"
+    _instead = INSTEAD_OF_ON_POLICY
     # The keys of the on-policy algorithms, which ask nothing else of self
     dump_logs = cast(Any, OnPolicyAlgorithm.dump_logs)
     _maybe_recommend_cpu = cast(Any, OnPolicyAlgorithm._maybe_recommend_cpu)

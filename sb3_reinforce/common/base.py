@@ -241,7 +241,7 @@ class BasePolicyGradient(Distributed):
             # First the policy, whose error names parameters. The optimizers' states fit only if all of these are loaded
             if "policy" not in own or storage.load_policy(self.policy, own.pop("policy"), exact_match):
                 for name, state in own.items():
-                    storage.load_optimizer(recursive_getattr(self, name), name, state, exact_match)
+                    storage.load_part(recursive_getattr(self, name), name, state, exact_match)
         except BaseException:
             super().set_parameters(before)
             raise

@@ -53,6 +53,14 @@ INSTEAD_OF_PPO = {
     "use_rms_prop": USE_POLICY_KWARGS,
     "rms_prop_eps": USE_POLICY_KWARGS,
 }
+UNDISCOUNTED = "it maximizes the undiscounted return of whole episodes, without a critic"
+PARAMETERS = "it perturbs the parameters, and does not need the probabilities of actions"
+# Arguments of the on-policy algorithms, and what FiniteDifference has instead
+INSTEAD_OF_ON_POLICY = {
+    "n_steps": "each of the candidates of its n_delta perturbations plays n_eval_episodes whole episodes",
+    **dict.fromkeys(("gamma", "gae_lambda", "vf_coef"), UNDISCOUNTED),
+    **dict.fromkeys(("ent_coef", "n_epochs", "clip_range", "use_sde", "sde_sample_freq"), PARAMETERS),
+}
 
 
 def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:

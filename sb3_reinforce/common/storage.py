@@ -162,6 +162,14 @@ def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: boo
     return not (missing or others)
 
 
+def load_part(part: th.nn.Module | th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
+    """Load the state of an optimizer, or of a network that a subclass saves."""
+    if isinstance(part, th.optim.Optimizer):
+        load_optimizer(part, name, state, exact_match)
+    else:
+        part.load_state_dict(state, strict=exact_match)
+
+
 def load_optimizer(optimizer: th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
     """Load the state of an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
     reason = optimizer_mismatch(optimizer, state)

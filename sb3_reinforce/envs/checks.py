@@ -6,6 +6,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 
@@ -45,7 +46,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 
 def as_reward(reward: Any, env: int) -> float:
     """Convert the reward of an environment, which must be one number, to a float."""
-    values = np.asarray(reward)
+    values = np.asarray(reward.detach().cpu() if isinstance(reward, th.Tensor) else reward)
     if values.size != 1 or not isinstance(values.item(), Decimal | Real):
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
     return float(values.item())

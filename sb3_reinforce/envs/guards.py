@@ -18,7 +18,7 @@ from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.common.moments import normalizers
 from sb3_reinforce.envs import stepping
 from sb3_reinforce.envs.checks import BadData, check_finite
-from sb3_reinforce.envs.starts import give_new_seeds, has_given_seeds
+from sb3_reinforce.envs.starts import base_of, give_new_seeds, has_given_seeds
 from sb3_reinforce.envs.workers import watch
 
 Learn = TypeVar("Learn", bound=Callable[..., Any])
@@ -53,7 +53,7 @@ def forget_seeds(model: Any) -> None:
 @contextmanager
 def guard(env: VecEnv | None) -> Iterator[None]:
     """Within the block, the environments below ``env`` and its wrappers are guarded, and numbers may underflow."""
-    base = None if env is None else env.unwrapped
+    base = None if env is None else base_of(env)
     # γ^t becomes 0, also for users who let NumPy raise errors
     with ExitStack() as stack, np.errstate(under="ignore"):
         # A subclass may have several environments behind one pipe

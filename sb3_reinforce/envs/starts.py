@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_reinforce.envs.checks import check_finite
 
@@ -14,31 +14,47 @@ from sb3_reinforce.envs.checks import check_finite
 MARK = "has_given_seeds"
 
 
+def base_of(env: VecEnv) -> Any:
+    """The environments below all wrappers; those of other libraries need not be a VecEnv, and lack ``unwrapped``."""
+    base = env
+    while isinstance(base, VecEnvWrapper):
+        base = base.venv
+    return base
+
+
 def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     """The first observations of episodes, environment i with the seed ``seeds[i]``; None leaves the seeds open."""
     if seeds is None:
         give_new_seeds(env)
         return env.reset()
-    setattr(env.unwrapped, MARK, True)
+    base = base_of(env)
+    if not hasattr(base, "env_method"):
+        raise cannot_seed(base)
+    setattr(base, MARK, True)
     # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
     # all that follows, which goes through every wrapper, continues its random numbers
     for seed in np.unique(seeds).tolist():
         try:
             env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
         except NotImplementedError as error:
-            raise ValueError(
-                "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
-                f"{type(env.unwrapped).__name__} does not have here: use another VecEnv. FiniteDifference trains "
-                "without it with common_random_numbers=False, and REINFORCE with episodes_per_start=1"
-            ) from error
+            raise cannot_seed(base) from error
     return env.reset()
+
+
+def cannot_seed(base: Any) -> ValueError:
+    """The error for environments that cannot be reset with a seed each."""
+    return ValueError(
+        "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
+        f"{type(base).__name__} does not have here: use another VecEnv. FiniteDifference trains without it with "
+        "common_random_numbers=False, and REINFORCE with episodes_per_start=1"
+    )
 
 
 def start_groups(env: VecEnv, size: int) -> Any:
     """First observations; each group of ``size`` neighbouring environments shares a start."""
     seeds = th.randint(2**31, (env.num_envs // size,)).numpy().repeat(size)
     # Pending seeds would replace these. VecNormalize need not know of this reset
-    env.unwrapped.reset()
+    base_of(env).reset()
     obs = start_episodes(env, seeds)
     check_groups(obs, size)
     return obs
@@ -46,7 +62,7 @@ def start_groups(env: VecEnv, size: int) -> Any:
 
 def has_given_seeds(env: VecEnv) -> bool:
     """Whether environments have started from given seeds, and may draw the same random numbers."""
-    return getattr(env.unwrapped, MARK, False)
+    return getattr(base_of(env), MARK, False)
 
 
 def give_new_seeds(env: VecEnv) -> None:
@@ -54,14 +70,15 @@ def give_new_seeds(env: VecEnv) -> None:
     if has_given_seeds(env):
         # By NumPy's generator: measurements seed PyTorch's, and training would repeat its starts after each of them
         reseed(env, np.random.randint(2**31))
-        setattr(env.unwrapped, MARK, False)
+        setattr(base_of(env), MARK, False)
 
 
 def reseed(env: VecEnv, seed: int) -> None:
     """Give environments different seeds, from their next reset on."""
     # A user's VecEnv may have no seeds
-    with suppress(NotImplementedError):
-        env.seed(seed)
+    if hasattr(base_of(env), "seed"):
+        with suppress(NotImplementedError):
+            env.seed(seed)
 
 
 def are_alike(obs: Any, size: int) -> bool:

@@ -174,7 +174,7 @@ class MaskedLogits(nn.Module):
 
 class MaskedPolicy(ActorCriticPolicy):
     """
-    An ``ActorCriticPolicy`` that never takes a masked action, for any algorithm that trains one.
+    An ``ActorCriticPolicy`` that never takes a masked action, for REINFORCE, FiniteDifference, A2C and PPO.
 
     π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
     log π, its gradient and the entropy belong to that distribution. Where nothing is allowed, as in terminal states,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import At, Record
-from environments import Scales
+from environments import Scales, Wrapper
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TransformObservation
 from models import plain
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_reinforce import REINFORCE, FiniteDifference, GymnasiumVecEnv
 from sb3_reinforce.diagnostics import compare_estimators, compare_starts, landscape, sample
@@ -269,6 +269,39 @@ def test_a_vec_env_need_not_be_seeded(name):
     model.set_env(env)
     assert model.learn(1).num_timesteps >= 4 * 200
     assert landscape(model, n_points=2, n_episodes=1).utilities.shape == (2, 2)
+
+
+class Simulator:
+    """Four environments of another library: neither a VecEnv nor with its methods for seeds."""
+
+    num_envs = 4
+    render_mode = None
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Discrete(2)
+
+    def reset(self):
+        self.t = 0
+        return np.zeros((4, 3), dtype=np.float32)
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        self.t += 1
+        obs = np.full((4, 3), self.t / 10, dtype=np.float32)
+        is_over = self.t == 5
+        infos = [{"terminal_observation": row} if is_over else {} for row in obs]
+        return self.reset() if is_over else obs, self.actions.astype(float), np.full(4, is_over), infos
+
+
+@pytest.mark.filterwarnings("ignore:The `render_mode` attribute")
+def test_below_its_wrappers_an_environment_need_not_be_a_vec_env():
+    env = Wrapper(VecMonitor(Simulator()))
+    assert REINFORCE("MlpPolicy", env, n_steps=8).learn(64).ep_info_buffer[0]["l"] == 5
+    with pytest.raises(ValueError, match="which Simulator does not have here"):
+        FiniteDifference("LinearPolicy", env).learn(64)
+    assert FiniteDifference("LinearPolicy", env, common_random_numbers=False).learn(64).num_timesteps >= 64
+    assert REINFORCE("MlpPolicy", env, n_episodes=8).learn(64).num_timesteps >= 64
 
 
 def test_memory_takes_one_episode_of_each_environment():

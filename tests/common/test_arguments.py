@@ -20,6 +20,7 @@ from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.common import arguments
 from sb3_reinforce.common.settings import LEARN_ARGUMENTS
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {algorithm: algorithm._arguments for algorithm in (REINFORCE, FiniteDifference)}
@@ -199,13 +200,22 @@ def test_of_several_wrong_arguments_the_same_is_named_in_every_process():
         make("steps", **wrong)
 
 
-@pytest.mark.parametrize("other", [A2C, PPO])
-def test_what_takes_the_place_of_arguments_of_other_algorithms_is_said(other):
-    names = signature(other).parameters.keys() - signature(REINFORCE).parameters.keys()
-    assert names
-    for name in names:
-        with pytest.raises(TypeError, match=f"REINFORCE has no argument {name}: "):
-            make("steps", **{name: 0.2})
+@pytest.mark.parametrize(
+    ("kind", "of_others"),
+    [
+        ("steps", signature(A2C).parameters.keys() | signature(PPO).parameters.keys()),
+        ("search", ["n_steps", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "clip_range", "use_sde"]),
+    ],
+)
+def test_what_takes_the_place_of_arguments_of_other_algorithms_is_said(kind, of_others):
+    cls = KINDS[kind][0]
+    for name in of_others - signature(cls).parameters.keys():
+        with pytest.raises(TypeError, match=f"{cls.__name__} has no argument {name}: "):
+            make(kind, **{name: 0.2})
+
+
+def test_a_recurrent_model_takes_n_steps_by_position_as_ppo_does():
+    assert RecurrentREINFORCE("MlpLstmPolicy", "CartPole-v1", 3e-4, 128, device="cpu").n_steps == 128
 
 
 def test_a_subclass_may_have_arguments_of_other_algorithms():

@@ -201,6 +201,32 @@ def test_a_mask_may_be_infinite(kind, tmp_path):
             model.set_parameters(states)
 
 
+@both
+def test_a_subclass_may_save_a_network_of_its_own(kind, tmp_path):
+    class Curious(KINDS[kind][0]):
+        def _setup_model(self):
+            super()._setup_model()
+            self.predictor = th.nn.Linear(2, 3)
+
+        def _excluded_save_params(self):
+            return [*super()._excluded_save_params(), "predictor"]
+
+        def _get_torch_save_params(self):
+            states, tensors = super()._get_torch_save_params()
+            return [*states, "predictor"], tensors
+
+    model, other = (Curious("MlpPolicy", Corridor(), device="cpu") for _ in range(2))
+    model.save(tmp_path / "model")
+    assert th.equal(Curious.load(tmp_path / "model", device="cpu").predictor.weight, model.predictor.weight)
+    wrong = {**model.get_parameters(), "predictor": {"weight": th.ones(3, 2)}}
+    before = plain(other.get_parameters())
+    with pytest.raises(RuntimeError, match="bias"):
+        other.set_parameters(wrong)
+    assert plain(other.get_parameters()) == before
+    other.set_parameters(wrong, exact_match=False)
+    assert th.equal(other.predictor.weight, th.ones(3, 2))
+
+
 def test_a_search_leaves_out_the_critics_optimizer():
     other, model = make("steps", Corridor()).learn(8), make("search", Corridor())
     with pytest.raises(ValueError, match="nothing else"):

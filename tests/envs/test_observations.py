@@ -126,6 +126,14 @@ def test_other_forms_of_a_reward_are_accepted(value, kind):
     assert model.ep_info_buffer[0]["r"] == 3 * float(value)
 
 
+@all_kinds
+@pytest.mark.filterwarnings("ignore:Converting a tensor")
+def test_a_reward_may_be_the_output_of_a_network(kind):
+    """Monitor warns of it, but PPO and A2C train."""
+    value = th.tensor(2.0, requires_grad=True)
+    assert make(kind, Corridor((3,), reward=lambda t, action: value)).learn(32).ep_info_buffer[0]["r"] == 6
+
+
 @both
 def test_what_a_dict_has_besides_its_space_is_left_alone(kind):
     """Also in the last observation before a time limit, whose value the critic predicts."""

@@ -118,6 +118,19 @@ def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs,
     assert (plain_critic(model.policy) is not None) == (change in ("none", "tied") and policy is ActorCriticPolicy)
 
 
+@both_policies
+def test_the_critic_can_learn_before_the_actor(policy):
+    model = make(policy, learning_rate=0.0, critic_learning_rate=2e-3)
+    before = {name: parameter.detach().clone() for name, parameter in model.policy.named_parameters()}
+    critics = ("value_net", "mlp_extractor.value_net")
+    for rate in (0.0, 2e-3):
+        model.learning_rate = rate
+        model.learn(1)
+        moved = {name for name, old in model.policy.named_parameters() if not th.equal(old, before[name])}
+        assert any(name.startswith(critics) for name in moved)
+        assert all(name.startswith(critics) for name in moved) == (rate == 0)
+
+
 def test_a_hook_on_a_parameter_of_the_critic_is_called():
     """Users mask gradients with them."""
     model = make(n_critic_updates=3)
