@@ -97,7 +97,7 @@ runs = {
     # Its critic starts with wild values and does not learn
     "useless_critic": (lambda: Task((4,), noisy), 8000, {"critic_learning_rate": 0.0, "prepare": wild_critic}),
     "deterministic_too_early": (lambda: Task((4,)), 640, {"prepare": strong_preference}),
-    "cut_episodes": (lambda: Task((3, 7)), 100, {"baseline": "mean", "n_steps": 10}),
+    "cut_episodes": (lambda: Task((3, 7)), 200, {"baseline": "mean", "n_steps": 10}),
 }
 for name, (env, timesteps, arguments) in runs.items():
     found = run(env, timesteps, **arguments)

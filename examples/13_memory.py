@@ -27,7 +27,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--length", type=int, default=5, help="steps from the cue to the junction")
 parser.add_argument("--memory", choices=("none", "rnn", "gru", "lstm"), default="rnn")
 parser.add_argument("--forget-bias", type=float, default=0.0, help="of the forget gates of lstm before training")
-parser.add_argument("--timesteps", type=int, default=30_000)
+parser.add_argument("--timesteps", type=int, default=45_000)
 parser.add_argument("--seed", type=int, default=0)
 # A notebook is started with other arguments
 arguments, _ = parser.parse_known_args()
@@ -102,7 +102,7 @@ def score(memory):
 mean = score(arguments.memory)
 print(f"Mean return of 200 episodes with memory {arguments.memory!r}: {mean:.2f} (best 1, by guessing 0)")
 # Longer corridors and other memories may need more steps, or not be learned
-if (arguments.length, arguments.memory) == (5, "rnn"):
+if (arguments.length, arguments.memory) == (5, "rnn") and arguments.timesteps >= 45_000:
     assert mean > 0.8, mean
 
 # %% [markdown]

@@ -57,7 +57,7 @@ until_solved = EvalCallback(
 model.learn(200_000, callback=until_solved, progress_bar=True)
 if model.num_timesteps < 200_000:
     print(f"Stopped after {model.num_timesteps:,} of 200,000 steps because the task is solved:")
-print(f"20 episodes scored {until_solved.best_mean_reward:.1f} on average.")
+print(f"The best evaluation of 20 episodes scored {until_solved.best_mean_reward:.1f} on average.")
 
 # %% [markdown]
 # One evaluation that was good enough to stop may have been lucky. So 100 more episodes are played.

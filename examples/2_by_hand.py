@@ -40,8 +40,8 @@ assert round(gradient, 2) == 1.83 and round(theta, 3) == 0.183
 # ## By the package
 #
 # The same problem as an environment, with a policy that is linear in an observation that is always 1. Its parameters
-# are a weight and a bias for the logit of each action. From the same three episodes, the gradient of the weight of
-# Right is the one above.
+# are a weight and a bias for the logit of each action. `sample` plays three episodes, in which the actions and returns
+# above replace those that were drawn. The gradient of the weight of Right is then the one above.
 
 
 # %%
@@ -83,7 +83,8 @@ print("gradient of the weights of Left and Right:", by_episode.mean(0)[:2].tolis
 assert abs(by_episode.mean(0)[1] - gradient) < 1e-6
 
 # %% [markdown]
-# `learn` draws its own three episodes, and moves the weight by 0.1 times their gradient. The bias of Right and both
+# `learn(1)` trains for at least one step, which is one update here. It draws its own three episodes, and moves the
+# weight by 0.1 times their gradient. The bias of Right and both
 # parameters of Left move as far, so $\pi(\text{Right})$ changes more than by hand.
 
 # %%
@@ -97,9 +98,9 @@ assert abs(model.policy.action_net.weight[1].item() - expected) < 1e-6
 # ## The score has mean zero
 #
 # $E_{a \sim \pi}[\nabla \log \pi(a)] = 0$ for every policy. So a constant that is subtracted from all returns leaves
-# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$, and its mean is exact.
-# For a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero up to its
-# standard error.
+# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$, and its mean can be
+# computed exactly. For a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero
+# up to its standard error.
 
 # %%
 probabilities = th.softmax(th.randn(4), dim=0)

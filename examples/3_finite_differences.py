@@ -106,8 +106,8 @@ assert round(slope) == 18 and round(standard_error) == 20
 #
 # The regression gradient perturbs all parameters at once, $k$ times, and fits a plane to the utilities. The rule of
 # thumb is $k = 2n$. What the plane does not explain is noise or curvature, so the fit comes with a standard error for
-# each component. Here the utility is linear, and all of it is noise. Over many repetitions, errors divided by their
-# standard errors follow Student's $t$.
+# each component. Here the utility is linear, so all that the plane does not explain is noise. Over many repetitions,
+# errors divided by their standard errors follow Student's $t$.
 
 # %%
 slopes = th.tensor([2.0, -1.0, 0.5], dtype=th.float64)

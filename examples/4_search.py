@@ -50,14 +50,15 @@ assert mean > 450, mean
 # There are twice as many perturbations as parameters. Each parameter changes with a standard deviation of 1 % of
 # $\|\theta\|$, but at least 0.05. R² is the share of the variance of the returns that the plane explains. All
 # candidates start alike and take their most likely actions, so the rest is not noise: the returns curve and jump. Even
-# pure noise would have an R² of $n / (k - 1) = 0.53$ on average, with $k = 16$ points and $n = 8$ slopes.
+# pure noise would have an R² of $n / (k - 1) = 0.53$ on average, with $k = 16$ points and $n = 8$ slopes. Where all
+# candidates earn the same, it is nan.
 #
 # ## Coordinates or random directions?
 #
 # Perturb one parameter at a time ("coordinate"), or all at once? Then each change may be normal ("gaussian"), $\pm 1$
-# ("rademacher"), or the perturbation has a fixed length ("sphere"). For a linear utility whose differences have noise
-# of variance 1, independent as in central differences, the variance of $\hat g$ is the trace of
-# $(\Delta^T \Delta)^{-1}$, where the rows of $\Delta$ are the perturbations.
+# ("rademacher"), or the perturbation has a fixed length ("sphere"). For a linear utility whose halved differences
+# $(U(\theta + \delta) - U(\theta - \delta)) / 2$ have independent noise of variance 1, the variance of $\hat g$ is the
+# trace of $(\Delta^T \Delta)^{-1}$, where the rows of $\Delta$ are the perturbations.
 
 # %%
 n, generator = 10, th.Generator().manual_seed(seed)
@@ -88,7 +89,7 @@ for name in ("gaussian", "sphere", "rademacher"):
 # Each episode of Pendulum starts at another angle, and the start decides much of the return. If all candidates of a
 # difference start alike, as they do by default (`common_random_numbers=True`), this luck cancels. `CandidateUtility`
 # samples the actions; with a small standard deviation most of the noise is in the starts. On CartPole starts hardly
-# differ, and common starts only cost steps: turn them off.
+# differ, and common starts only cost steps: turn them off (the run above kept the default).
 
 # %%
 env = make_vec_env("Pendulum-v1", 8, seed=seed)

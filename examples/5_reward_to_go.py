@@ -35,6 +35,7 @@ assert reward_to_go(rewards, dones, gamma=1.0)[:, 0].tolist() == [6, 5, 2, 30, 2
 #
 # The same 400 episodes of an untrained policy, weighted in both ways, with $\gamma = 1$. Each episode gives one
 # gradient for each way; the variance is the trace of its covariance. It is several times smaller with the reward-to-go.
+# The square brackets are 95 % bootstrap intervals: the episodes are drawn again with replacement, many times.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)

@@ -79,8 +79,9 @@ plt.show()
 # ## CartPole
 #
 # Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
-# baseline on the same 200 episodes. Both variances of a ratio to "none" come from the same resamples, so part of their
-# fluctuation cancels. The ratio of "optimal" is therefore known more precisely than its variance.
+# baseline on the same 200 episodes. Both variances of a ratio to "none" come from the same resamples (episodes drawn
+# again with replacement), so part of their fluctuation cancels. The ratio of "optimal" is therefore known more
+# precisely than its variance.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)

@@ -46,10 +46,12 @@ assert check.passed
 # ## Signal from a step
 #
 # One estimate is one episode for the likelihood ratio, whose baseline comes from the other episodes. For the others it
-# is one episode for each perturbed policy. Each parameter is perturbed alone, where a regression would be the central
-# difference. The perturbations are large (1.0), since the noise of single episodes drowns smaller differences. Their
-# signs are random, so what curvature adds to a forward difference cancels in the mean, but is noise until then. The
-# cosine is between the *expected* estimate and the gradient; the signal-to-noise ratio is divided by the steps.
+# is one episode for each perturbed policy. Each parameter is perturbed alone, by +1 and −1: with these perturbations a
+# regression solves the equation of the central difference, so it is left out. The perturbations are large, since the
+# noise of single episodes drowns smaller differences. Their signs are random, so what curvature adds to a forward
+# difference cancels in the mean, but is noise until then. The cosine is between the *expected* estimate and the
+# gradient. The signal-to-noise ratio is divided by the steps. Perturbed policies that share a start wait for the
+# longest episode of their round, and these steps count: with one environment the differences need fewer.
 
 # %%
 estimators = ("likelihood_ratio", "forward", "central")

@@ -30,7 +30,7 @@ generator = np.random.default_rng(seed)
 
 # %%
 def climb(rate, n_episodes, with_baseline):
-    """The mean of π(Right) over the runs, before the first update and after each."""
+    """The mean of π(Right) over the runs, before the first update and after each; a baseline needs two episodes."""
     theta, means = np.zeros((1000, 1)), []
     for _ in range(4000 // n_episodes + 1):
         p = 1 / (1 + np.exp(-theta))
@@ -61,7 +61,7 @@ ax.set(title="Mean of 1000 runs", xlabel="episodes", ylabel="π(Right)", ylim=(0
 ax.legend(frameon=False, fontsize="small")
 plt.show()
 large, medium, small, batch, baseline = curves.values()
-assert large[-1] < 0.88 and 0.93 < medium[-1] < batch[-1] < 0.99 < small[-1]
+assert large[-1] < 0.88 and 0.93 < min(medium[-1], batch[-1]) and max(medium[-1], batch[-1]) < 0.99 < small[-1]
 # A single run that is lost costs 0.001
 assert small[40] < 0.62 and small[400] < 0.93 and baseline[20] > 0.99 and baseline[-1] > 0.9992
 
@@ -74,8 +74,8 @@ assert small[40] < 0.62 and small[400] < 0.93 and baseline[20] > 0.99 and baseli
 # ## How noisy is the gradient of a real run?
 #
 # `GradientQualityCallback` logs `gradient/noise_scale`, the number of episodes whose mean gradient has a
-# signal-to-noise ratio of 1 (inf where no signal is detected). It grows as the policy improves: longer episodes add
-# more noise to their gradient than signal.
+# signal-to-noise ratio of 1 (inf where no signal is detected). In this run it rises several times over as the policy
+# improves, though not at every update.
 
 
 # %%

@@ -139,6 +139,8 @@ class RecurrentREINFORCE(REINFORCE):
             if self._last_obs is None or self._are_whole:
                 self._next_state = None
             elif self._actor is not None:
+                # If Ctrl-C comes before the new states are known, the environments are reset
+                self._next_state = None
                 self._next_state = self._state_after_rollout().cpu()
             # It cannot be pickled
             self._actor = None

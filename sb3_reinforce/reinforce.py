@@ -353,6 +353,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
                 self.rollout = self._complete(rollout_buffer, columns, route, baseline, n_rollout_steps is not None)
+                self._running = self._running.after(rollout_buffer.rewards, columns.dones, self.gamma)
             is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
@@ -367,7 +368,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         # A process that has sent its part to process 0 has no rollout
         if columns is None or self.rollout is None:
             return True
-        self._running = self._running.after(rollout_buffer.rewards, columns.dones, self.gamma)
         self.logger.record("rollout/complete_fraction", float(in_finished_episode(columns.dones).mean()))
         if n_rollout_steps is None:
             self.logger.record("rollout/used_fraction", float(self.rollout.used.double().mean()))
@@ -559,6 +559,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         check_reinforce(self)
         check_starts(self)
         tb_log_name = type(self).__name__ if tb_log_name is None else tb_log_name
+        if reset_num_timesteps:
+            # If the reset fails or is interrupted, the next call of learn resets
+            self._last_obs = None
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

@@ -11,6 +11,7 @@ from functools import partial, wraps
 from typing import Any, TypeVar, cast
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -54,8 +55,9 @@ def forget_seeds(model: Any) -> None:
 def guard(env: VecEnv | None) -> Iterator[None]:
     """Within the block, the environments below ``env`` and its wrappers are guarded, and numbers may underflow."""
     base = None if env is None else base_of(env)
-    # γ^t becomes 0, also for users who let NumPy raise errors
-    with ExitStack() as stack, np.errstate(under="ignore"):
+    # γ^t becomes 0, also for users who let NumPy raise errors. Ctrl-C at the end of a block of th.no_grad would leave
+    # PyTorch's gradients off
+    with ExitStack() as stack, np.errstate(under="ignore"), th.set_grad_enabled(th.is_grad_enabled()):
         # A subclass may have several environments behind one pipe
         if isinstance(base, SubprocVecEnv) and len(base.remotes) == base.num_envs:
             watch(base)

@@ -28,12 +28,13 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor
-    :raises ValueError: If Δ does not fit θ, or all perturbations are zero
+    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises ValueError: If Δ does not fit θ, all perturbations are zero, or the utility does not return a finite number
+        for each candidate
     """
     deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = utility(th.cat([theta[None], theta + deltas])).to(theta)
+    utilities = evaluate(utility, th.cat([theta[None], theta + deltas]))
     return solve(deltas, utilities[1:] - utilities[0])
 
 
@@ -47,12 +48,13 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
         section 3.3), which biases ĝ towards them; None for all
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor
-    :raises ValueError: If Δ does not fit θ, or all perturbations are zero
+    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises ValueError: If Δ does not fit θ, all perturbations are zero, or the utility does not return a finite number
+        for each candidate
     """
     deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = utility(th.stack([theta + deltas, theta - deltas])).to(theta)
+    utilities = evaluate(utility, th.stack([theta + deltas, theta - deltas]))
     top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
     plus, minus = utilities[:, top]
     return solve(2 * deltas[top], plus - minus)
@@ -69,13 +71,14 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor
-    :raises ValueError: If Δ does not fit θ, or all perturbations are equal
+    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises ValueError: If Δ does not fit θ, all perturbations are equal, or the utility does not return a finite number
+        for each candidate
     """
     deltas = check_deltas(theta, deltas)
     design = deltas - deltas.mean(0)
     check_design(design, deltas)
-    utilities = utility(theta + deltas).to(theta)
+    utilities = evaluate(utility, theta + deltas)
     return solve(design, utilities - utilities.mean())
 
 
@@ -86,10 +89,17 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
+def evaluate(utility: Utility, candidates: th.Tensor) -> th.Tensor:
+    """The utilities of candidates, one for each row."""
+    return check_tensor("utility", utility(candidates), candidates.shape[:-1]).to(candidates)
+
+
 def check_deltas(theta: th.Tensor, deltas: Any) -> th.Tensor:
     """Return finite perturbations, rows like θ, in its precision."""
     if not isinstance(deltas, th.Tensor):
         raise TypeError(f"deltas must be a tensor, got {deltas!r} of type {type(deltas).__name__}")
+    if not theta.is_floating_point():
+        raise TypeError(f"theta must be a tensor of floats, got {theta}")
     if len(deltas.shape) != 2 or len(deltas) == 0 or deltas.shape[1:] != theta.shape or not deltas.isfinite().all():
         raise ValueError(
             f"deltas must be finite numbers of shape (k, n), with k > 0 and (n,) = {tuple(theta.shape)} the shape of "
@@ -210,7 +220,7 @@ def check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:
     """Return a finite tensor of one shape in float64 on the CPU."""
     if not isinstance(value, th.Tensor) or value.shape != shape:
         got = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, th.Tensor) else repr(value)
-        raise ValueError(f"{name} must return a tensor of shape {shape}, got {got}")
+        raise ValueError(f"{name} must return a tensor of shape {tuple(shape)}, got {got}")
     if not value.isfinite().all():
         raise ValueError(f"{name} must return finite numbers, got {value}")
     return value.detach().to("cpu", th.float64)

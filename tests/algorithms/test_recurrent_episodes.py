@@ -170,6 +170,22 @@ def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout
     assert model.learn(10, reset_num_timesteps=False).num_timesteps == 40
 
 
+def test_episodes_whose_memory_is_lost_by_an_interruption_are_reset():
+    model = RecurrentREINFORCE("MlpLstmPolicy", Corridor((40,)), n_steps=5, seed=0, device="cpu").learn(10)
+    state_after = model.policy.state_after
+
+    def interrupt(rows):
+        model.policy.state_after = state_after
+        raise KeyboardInterrupt
+
+    model.policy.state_after = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(20, reset_num_timesteps=False)
+    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].all())
+    model.learn(10, starts, reset_num_timesteps=False)
+    assert starts.records == [True, False]
+
+
 def test_a_trained_model_can_be_pickled():
     model = make_recurrent(env=make_vec_env("CartPole-v1", 2), double=False, n_steps=8).learn(32)
     copy = cloudpickle.loads(cloudpickle.dumps(model))

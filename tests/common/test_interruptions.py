@@ -6,12 +6,13 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import torch as th
 from callbacks import At, Record
 from environments import Corridor, Faulty
 from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, reinforce
 from sb3_reinforce.common.interruptions import interruptible, uninterrupted
 
 
@@ -71,6 +72,55 @@ def assert_counters_agree(model):
         # The search reads the schedules when an update starts, and may have started another one
         rate = model.policy.optimizer.param_groups[0]["lr"]
         assert rate == pytest.approx(model.lr_schedule(model._current_progress_remaining))
+
+
+def test_after_a_reset_that_fails_episodes_start_again():
+    """Not with the last observation of the run before."""
+    env = Corridor((50,))
+    model = make("steps", env).learn(20)
+    reset = env.reset
+
+    def reset_and_fail(**kwargs):
+        reset(**kwargs)
+        env.reset = reset
+        raise OSError("after the reset")
+
+    env.reset = reset_and_fail
+    with pytest.raises(OSError, match="after the reset"):
+        model.learn(20)
+    rollouts = Record(lambda model: (model.rollout.observations[:, 0].argmax(-1), model.rollout.timesteps[:, 0]))
+    model.learn(16, rollouts, reset_num_timesteps=False)
+    assert plain(rollouts.records) == plain([[th.arange(i, i + 8)] * 2 for i in (0, 8)])
+
+
+def test_timesteps_are_right_after_an_interruption_behind_a_rollout(monkeypatch):
+    model = make("steps", Corridor((50,)))
+
+    def interrupt(env):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reinforce, "has_given_seeds", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(16)
+    model.learn(8, reset_num_timesteps=False)
+    rollout = model.rollout
+    assert th.equal(rollout.timesteps[:, 0], rollout.observations[:, 0].argmax(-1))
+
+
+@all_kinds
+def test_an_interruption_leaves_gradients_on(kind):
+    """Where it comes as a block of ``th.no_grad`` ends."""
+
+    class Ending(Corridor):
+        def step(self, action):
+            th.set_grad_enabled(False)
+            raise KeyboardInterrupt
+
+    with th.enable_grad():
+        with pytest.raises(KeyboardInterrupt):
+            make(kind, Ending()).learn(8)
+        assert th.is_grad_enabled()
 
 
 def signal_in_third_update(model, *numbers):

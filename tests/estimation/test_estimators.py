@@ -137,6 +137,27 @@ def test_perturbations_may_be_of_another_precision(name):
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(
+    ("utility", "got"),
+    [
+        (lambda x: exponential(x).sum(), r"of shape \(\)"),
+        (lambda x: x, rf"of shape \(.*{N}\)"),
+        (lambda x: exponential(x).numpy(), "array"),
+        (lambda x: th.nan * exponential(x), "nan"),
+    ],
+)
+def test_a_utility_must_return_one_number_for_each_candidate(name, utility, got):
+    with pytest.raises(ValueError, match=rf"utility must return .*, got .*{got}"):
+        ESTIMATORS[name](utility, th.zeros(N).double(), normal(2 * N, N, seed=0))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_theta_must_be_floats(name):
+    with pytest.raises(TypeError, match="theta must be a tensor of floats"):
+        ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N, dtype=th.long), th.eye(N))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_perturbations_that_are_no_tensor_are_named(name):
     with pytest.raises(TypeError, match="deltas must be a tensor, got array"):
         ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N).double(), np.eye(N))
