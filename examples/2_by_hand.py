@@ -84,8 +84,8 @@ assert abs(by_episode.mean(0)[1] - gradient) < 1e-6
 
 # %% [markdown]
 # `learn(1)` trains for at least one step, which is one update here. It draws its own three episodes, and moves the
-# weight by 0.1 times their gradient. The bias of Right and both
-# parameters of Left move as far, so $\pi(\text{Right})$ changes more than by hand.
+# weight by 0.1 times their gradient. The bias of Right and both parameters of Left move as far, so
+# $\pi(\text{Right})$ changes more than by hand.
 
 # %%
 model.learn(1)

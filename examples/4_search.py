@@ -50,8 +50,8 @@ assert mean > 450, mean
 # There are twice as many perturbations as parameters. Each parameter changes with a standard deviation of 1 % of
 # $\|\theta\|$, but at least 0.05. R² is the share of the variance of the returns that the plane explains. All
 # candidates start alike and take their most likely actions, so the rest is not noise: the returns curve and jump. Even
-# pure noise would have an R² of $n / (k - 1) = 0.53$ on average, with $k = 16$ points and $n = 8$ slopes. Where all
-# candidates earn the same, it is nan.
+# pure noise would have an R² of $n / (k - 1) = 0.53$ on average, with $k = 16$ points and $n = 8$ slopes. If all
+# candidates earn the same, R² is NaN.
 #
 # ## Coordinates or random directions?
 #

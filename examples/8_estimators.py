@@ -46,12 +46,13 @@ assert check.passed
 # ## Signal from a step
 #
 # One estimate is one episode for the likelihood ratio, whose baseline comes from the other episodes. For the others it
-# is one episode for each perturbed policy. Each parameter is perturbed alone, by +1 and −1: with these perturbations a
-# regression solves the equation of the central difference, so it is left out. The perturbations are large, since the
-# noise of single episodes drowns smaller differences. Their signs are random, so what curvature adds to a forward
-# difference cancels in the mean, but is noise until then. The cosine is between the *expected* estimate and the
-# gradient. The signal-to-noise ratio is divided by the steps. Perturbed policies that share a start wait for the
-# longest episode of their round, and these steps count: with one environment the differences need fewer.
+# is one episode for each perturbed policy. Each parameter is perturbed alone: by +1 and −1 in a central difference, by
+# one of the two at random in a forward one. What curvature adds to a forward difference therefore cancels in the mean,
+# but is noise until then. A regression would use both signs and solve the equation of the central difference, so it is
+# left out. The perturbations are large, since the noise of single episodes drowns smaller differences. The cosine is
+# between the *expected* estimate and the gradient. The signal-to-noise ratio is divided by the steps. Perturbed
+# policies that share a start wait for the longest episode of their round, and these steps count: with one environment
+# the differences need fewer.
 
 # %%
 estimators = ("likelihood_ratio", "forward", "central")

@@ -74,8 +74,8 @@ assert small[40] < 0.62 and small[400] < 0.93 and baseline[20] > 0.99 and baseli
 # ## How noisy is the gradient of a real run?
 #
 # `GradientQualityCallback` logs `gradient/noise_scale`, the number of episodes whose mean gradient has a
-# signal-to-noise ratio of 1 (inf where no signal is detected). In this run it rises several times over as the policy
-# improves, though not at every update.
+# signal-to-noise ratio of 1 (inf where no signal is detected). In this run it rises as the policy improves, though not
+# at every update.
 
 
 # %%

@@ -54,12 +54,17 @@ INSTEAD_OF_PPO = {
     "rms_prop_eps": USE_POLICY_KWARGS,
 }
 UNDISCOUNTED = "it maximizes the undiscounted return of whole episodes, without a critic"
+NO_BUFFER = "it keeps the returns of its episodes, and no steps"
 PARAMETERS = "it perturbs the parameters, and does not need the probabilities of actions"
 # Arguments of the on-policy algorithms, and what FiniteDifference has instead
 INSTEAD_OF_ON_POLICY = {
     "n_steps": "each of the candidates of its n_delta perturbations plays n_eval_episodes whole episodes",
+    "n_epochs": "it takes one step per update",
+    "normalize_advantage": "set standardize_utilities=True",
+    **dict.fromkeys(("use_rms_prop", "rms_prop_eps"), USE_POLICY_KWARGS),
     **dict.fromkeys(("gamma", "gae_lambda", "vf_coef"), UNDISCOUNTED),
-    **dict.fromkeys(("ent_coef", "n_epochs", "clip_range", "use_sde", "sde_sample_freq"), PARAMETERS),
+    **dict.fromkeys(("batch_size", "rollout_buffer_class", "rollout_buffer_kwargs"), NO_BUFFER),
+    **dict.fromkeys(("ent_coef", "clip_range", "clip_range_vf", "target_kl", "use_sde", "sde_sample_freq"), PARAMETERS),
 }
 
 

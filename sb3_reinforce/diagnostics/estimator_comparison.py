@@ -48,8 +48,8 @@ class EstimatorRow:
     :param estimator: Its name
     :param cosine: Cosine of its expectation to the likelihood-ratio gradient; the interval includes the noise of both
     :param snr_per_step: ``‖E ĝ‖² / tr Σ`` of one estimate, divided by its environment steps
-    :param steps: Environment steps of one estimate, of all environments together; also those of environments that wait
-        for the longest episode of a round, so with fewer environments there are fewer
+    :param steps: Environment steps of one estimate, of all environments together, including those that wait for the
+        longest episode of a round: fewer environments take fewer steps
     :param seconds: Seconds for one estimate
     """
 

@@ -44,14 +44,14 @@ def resample_counts(m: int, n_resamples: int, seed: int) -> th.Tensor:
 
 def interval(values: th.Tensor, confidence: float) -> Estimate:
     """Percentile interval of a statistic of sample and resamples (1 + r,) (Efron and Tibshirani, 1993, chapter 13)."""
-    # Without a variance in the resample, a ratio is 0 / 0
-    known = values[1:][~values[1:].isnan()]
-    if len(known) == 0:
-        return Estimate(float(values[0]), float("nan"), float("nan"))
     tail = (1 - confidence) / 2
+    # Where a resample has no variance, a ratio is 0 / 0: it may be anything, and counts as beyond both ends
+    unknown = values[1:].isnan()
+    if unknown.double().mean() > tail:
+        return Estimate(float(values[0]), float("nan"), float("nan"))
     # An end is a value that occurred: infinite noise scales cannot be interpolated
-    low = known.quantile(tail, interpolation="lower")
-    high = known.quantile(1 - tail, interpolation="higher")
+    low = values[1:].masked_fill(unknown, -th.inf).quantile(tail, interpolation="lower")
+    high = values[1:].masked_fill(unknown, th.inf).quantile(1 - tail, interpolation="higher")
     return Estimate(float(values[0]), float(low), float(high))
 
 

@@ -28,7 +28,7 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises TypeError: If Δ is not a tensor, or θ not a tensor of floats
     :raises ValueError: If Δ does not fit θ, all perturbations are zero, or the utility does not return a finite number
         for each candidate
     """
@@ -48,7 +48,7 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
         section 3.3), which biases ĝ towards them; None for all
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises TypeError: If Δ is not a tensor, or θ not a tensor of floats
     :raises ValueError: If Δ does not fit θ, all perturbations are zero, or the utility does not return a finite number
         for each candidate
     """
@@ -71,7 +71,7 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is no tensor, or θ not one of floats
+    :raises TypeError: If Δ is not a tensor, or θ not a tensor of floats
     :raises ValueError: If Δ does not fit θ, all perturbations are equal, or the utility does not return a finite number
         for each candidate
     """
@@ -96,10 +96,10 @@ def evaluate(utility: Utility, candidates: th.Tensor) -> th.Tensor:
 
 def check_deltas(theta: th.Tensor, deltas: Any) -> th.Tensor:
     """Return finite perturbations, rows like θ, in its precision."""
+    if not isinstance(theta, th.Tensor) or not theta.is_floating_point():
+        raise TypeError(f"theta must be a tensor of floats, got {theta!r}")
     if not isinstance(deltas, th.Tensor):
         raise TypeError(f"deltas must be a tensor, got {deltas!r} of type {type(deltas).__name__}")
-    if not theta.is_floating_point():
-        raise TypeError(f"theta must be a tensor of floats, got {theta}")
     if len(deltas.shape) != 2 or len(deltas) == 0 or deltas.shape[1:] != theta.shape or not deltas.isfinite().all():
         raise ValueError(
             f"deltas must be finite numbers of shape (k, n), with k > 0 and (n,) = {tuple(theta.shape)} the shape of "

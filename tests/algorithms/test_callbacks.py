@@ -41,6 +41,18 @@ def test_callbacks_find_the_locals_of_a2c(kind):
     assert place == (3, 0) and all(env.observation_space.contains(each) for each in obs)
 
 
+def test_the_observation_of_a_step_is_the_models_last_one():
+    """The documentation names it in the place of A2C's ``obs_tensor``."""
+    model = A2C("MlpPolicy", make_vec_env(lambda: Corridor((4,)), 2), n_steps=8, device="cpu")
+    last = Record(lambda model: model.policy.obs_to_tensor(model._last_obs)[0].equal(last.locals["obs_tensor"]), "step")
+    model.learn(16, last)
+    assert last.records == [True] * 8
+    model = make("steps", make_vec_env(lambda: Corridor((4,)), 2))
+    last = Record(lambda model: model._last_obs.copy(), "step")
+    model.learn(16, last)
+    assert np.array_equal(last.records, model.rollout_buffer.observations)
+
+
 @all_kinds
 def test_a_callback_stops_training_at_the_very_step(kind):
     model = make(kind, make_vec_env(lambda: Corridor((4,)), 2))

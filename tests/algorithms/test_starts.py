@@ -297,7 +297,9 @@ class Simulator:
 @pytest.mark.filterwarnings("ignore:The `render_mode` attribute")
 def test_below_its_wrappers_an_environment_need_not_be_a_vec_env():
     env = Wrapper(VecMonitor(Simulator()))
-    assert REINFORCE("MlpPolicy", env, n_steps=8).learn(64).ep_info_buffer[0]["l"] == 5
+    model = REINFORCE("MlpPolicy", env, n_steps=8).learn(64)
+    assert model.ep_info_buffer[0]["l"] == 5
+    assert len(compare_estimators(model, 4, estimators="likelihood_ratio", n_resamples=2)) == 1
     with pytest.raises(ValueError, match="which Simulator does not have here"):
         FiniteDifference("LinearPolicy", env).learn(64)
     assert FiniteDifference("LinearPolicy", env, common_random_numbers=False).learn(64).num_timesteps >= 64

@@ -128,15 +128,17 @@ def test_an_interval_holds_its_estimate_and_can_be_infinite():
     assert interval(values, 0.999).high == th.inf
 
 
-def test_resamples_without_a_variance_leave_the_interval_known():
+def test_a_few_resamples_without_a_variance_leave_the_interval_known():
     """Few episodes of a task with sparse rewards have a gradient, and some resamples have none of them."""
     gradients = th.cat([draw(4, th.Generator().manual_seed(5)), th.zeros(96, 8, dtype=th.float64)])
     counts = resample_counts(100, 1000, 0)
     assert (counts[1:, :4].sum(1) == 0).any(), "0 / 0 there"
     snr = gradient_statistics(gradients).snr
     assert snr.low < snr.value < snr.high
-    nothing = gradient_statistics(th.zeros(5, 8)).snr
-    assert np.isnan([nothing.value, nothing.low, nothing.high]).all()
+    # A third of the resamples do not have the only one
+    for few in (gradients[3:], th.zeros(5, 8)):
+        snr = gradient_statistics(few).snr
+        assert np.isnan([snr.low, snr.high]).all()
 
 
 @pytest.mark.parametrize(

@@ -152,9 +152,10 @@ def test_a_utility_must_return_one_number_for_each_candidate(name, utility, got)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_theta_must_be_floats(name):
+@pytest.mark.parametrize("theta", [th.zeros(N, dtype=th.long), np.zeros(N)], ids=type)
+def test_theta_must_be_a_tensor_of_floats(name, theta):
     with pytest.raises(TypeError, match="theta must be a tensor of floats"):
-        ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N, dtype=th.long), th.eye(N))
+        ESTIMATORS[name](lambda x: pytest.fail("evaluated"), theta, th.eye(N))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

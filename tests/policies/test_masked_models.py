@@ -54,9 +54,14 @@ def test_a_policy_that_is_saved_alone_acts_alike(task, tmp_path):
     assert th.equal(*(each(obs, deterministic=True)[0] for each in (policy, loaded)))
 
 
+def with_dicts():
+    return ActionMaskObservation(Masked(spaces.Dict({"x": VECTOR}), spaces.Discrete(5), lengths=(3, 7)))
+
+
 VEC_ENVS = {
     "dummy": two_environments,
     "normalize": lambda: VecNormalize(two_environments(), norm_obs_keys=["observation"]),
+    "dicts": lambda: VecNormalize(make_vec_env(with_dicts, 2), norm_obs_keys=["x"]),
     "rewards": lambda: VecNormalize(two_environments(), norm_obs=False),
     "gymnasium": lambda: GymnasiumVecEnv(SyncVectorEnv([environment] * 2, autoreset_mode=AutoresetMode.SAME_STEP)),
 }
