@@ -55,7 +55,7 @@ INSTEAD_OF_PPO = {
 }
 UNDISCOUNTED = "it maximizes the undiscounted return of whole episodes, without a critic"
 NO_BUFFER = "it keeps the returns of its episodes, and no steps"
-PARAMETERS = "it perturbs the parameters, and does not need the probabilities of actions"
+NO_PROBABILITIES = "it perturbs the parameters, and does not need the probabilities of actions"
 # Arguments of the on-policy algorithms, and what FiniteDifference has instead
 INSTEAD_OF_ON_POLICY = {
     "n_steps": "each of the candidates of its n_delta perturbations plays n_eval_episodes whole episodes",
@@ -64,7 +64,8 @@ INSTEAD_OF_ON_POLICY = {
     **dict.fromkeys(("use_rms_prop", "rms_prop_eps"), USE_POLICY_KWARGS),
     **dict.fromkeys(("gamma", "gae_lambda", "vf_coef"), UNDISCOUNTED),
     **dict.fromkeys(("batch_size", "rollout_buffer_class", "rollout_buffer_kwargs"), NO_BUFFER),
-    **dict.fromkeys(("ent_coef", "clip_range", "clip_range_vf", "target_kl", "use_sde", "sde_sample_freq"), PARAMETERS),
+    **dict.fromkeys(("ent_coef", "clip_range", "clip_range_vf", "target_kl"), NO_PROBABILITIES),
+    **dict.fromkeys(("use_sde", "sde_sample_freq"), NO_PROBABILITIES),
 }
 
 

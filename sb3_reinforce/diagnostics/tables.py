@@ -47,7 +47,7 @@ def interval(values: th.Tensor, confidence: float) -> Estimate:
     tail = (1 - confidence) / 2
     # Where a resample has no variance, a ratio is 0 / 0: it may be anything, and counts as beyond both ends
     unknown = values[1:].isnan()
-    if unknown.double().mean() > tail:
+    if unknown.sum() > tail * (len(unknown) - 1):
         return Estimate(float(values[0]), float("nan"), float("nan"))
     # An end is a value that occurred: infinite noise scales cannot be interpolated
     low = values[1:].masked_fill(unknown, -th.inf).quantile(tail, interpolation="lower")

@@ -128,6 +128,17 @@ def test_an_interval_holds_its_estimate_and_can_be_infinite():
     assert interval(values, 0.999).high == th.inf
 
 
+def test_unknown_values_count_as_beyond_both_ends():
+    """As many of 1,000 as lie beyond an end of 95 % at most; else the ends are not known."""
+    values = th.arange(1001).double()
+    values[1:25] = th.nan
+    found = interval(values, 0.95)
+    assert (found.low, found.high) == (25, 1000)
+    values[25] = th.nan
+    found = interval(values, 0.95)
+    assert np.isnan([found.low, found.high]).all()
+
+
 def test_a_few_resamples_without_a_variance_leave_the_interval_known():
     """Few episodes of a task with sparse rewards have a gradient, and some resamples have none of them."""
     gradients = th.cat([draw(4, th.Generator().manual_seed(5)), th.zeros(96, 8, dtype=th.float64)])
