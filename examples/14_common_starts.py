@@ -99,5 +99,5 @@ assert grouped[1] < alone[1] and grouped[2] < alone[3]
 
 # %% [markdown]
 # Episodes should share their start where the start decides most of the return, as here: the groups cost less after the
-# same number of episodes. With eight of the seeds 0 to 9 they also cost less after 4,096 episodes than independent
-# starts after 8,192.
+# same number of episodes. With eight of the seeds 0 to 9 (not listed) they also cost less after 4,096 episodes than
+# independent starts after 8,192.

@@ -21,8 +21,8 @@ seed = 0
 th.set_num_threads(1)
 
 # %% [markdown]
-# The policy stays as it is (`learning_rate=0`), only its critic learns. 300 episodes are drawn before and 300 after,
-# and the gradients of all $\lambda$ are computed from the same ones.
+# The policy stays as it is (`learning_rate=0`), only its critic learns. 300 episodes are drawn before and 300 after;
+# each time the gradients of all $\lambda$ are computed from the same episodes.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
