@@ -134,7 +134,7 @@ assert (rollout.returns - leave_one_out(rollout)).flatten().tolist() == [-3, 0, 
 # %%
 scores = np.eye(3) - 1 / 3
 returns = np.array([8.0, 10.0, 12.0])
-none, centred = ((returns - baseline)[:, None] * scores for baseline in (0.0, 10.0))
-for name, gradients in (("no baseline", none), ("baseline 10", centred)):
+none, centered = ((returns - baseline)[:, None] * scores for baseline in (0.0, 10.0))
+for name, gradients in (("no baseline", none), ("baseline 10", centered)):
     print(f"{name}: mean {gradients.mean(0).round(3)}, variance {gradients.var(0).sum():.2f}")
-assert np.allclose(none.mean(0), centred.mean(0)) and none.var(0).sum() > 70 * centred.var(0).sum()
+assert np.allclose(none.mean(0), centered.mean(0)) and none.var(0).sum() > 70 * centered.var(0).sum()

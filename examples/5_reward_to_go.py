@@ -92,13 +92,13 @@ truth = 0.25 * 0.8 ** np.arange(10)
 is_exact = {}
 
 figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
-for (name, weight), colour, shift in zip(weights.items(), ("#0072B2", "#D55E00"), (-0.1, 0.1), strict=True):
+for (name, weight), color, shift in zip(weights.items(), ("#0072B2", "#D55E00"), (-0.1, 0.1), strict=True):
     (gradients,) = gradients_by_episode(rollout, weight)
     # The weights of "off" come first, then those of "on"
     by_switch = gradients[:, 10:20].numpy()
     mean, standard_error = by_switch.mean(axis=0), by_switch.std(axis=0) / len(by_switch) ** 0.5
     label = f"{name} (± 2 standard errors)"
-    ax.errorbar(np.arange(10) + shift, mean, 2 * standard_error, fmt="o", color=colour, label=label)
+    ax.errorbar(np.arange(10) + shift, mean, 2 * standard_error, fmt="o", color=color, label=label)
     is_exact[name] = (np.abs(mean - truth) < 4.5 * standard_error).all()
 assert is_exact["with γᵗ"] and not is_exact["without γᵗ"]
 ax.plot(truth, color="black", label="exact: γᵗ / 4")

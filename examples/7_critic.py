@@ -56,11 +56,11 @@ found["trained critic"] = bias_and_noise()
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.4), sharex=True, layout="constrained")
-for (name, (bias, noise)), colour in zip(found.items(), ("#D55E00", "#0072B2"), strict=True):
+for (name, (bias, noise)), color in zip(found.items(), ("#D55E00", "#0072B2"), strict=True):
     both = np.hypot(bias, noise)
     for ax, values in zip(axes, (bias, noise, both), strict=True):
         # Evenly spaced, since most of the λs are close to 1
-        ax.plot([str(lam) for lam in lambdas], values, marker="o", color=colour, label=name)
+        ax.plot([str(lam) for lam in lambdas], values, marker="o", color=color, label=name)
     print(name)
     for row in zip(lambdas, bias, noise, both, strict=True):
         print("  λ = {:4.2f}: bias {:4.2f}, noise {:5.2f}, both {:5.2f}".format(*row))

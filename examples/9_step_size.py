@@ -52,9 +52,9 @@ settings = {
 }
 curves = {name: climb(*setting) for name, setting in settings.items()}
 figure, ax = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-colours = ("#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2")
-for (name, curve), (_, n_episodes, _), colour in zip(curves.items(), settings.values(), colours, strict=True):
-    ax.semilogx(n_episodes * np.arange(1, len(curve)), curve[1:], color=colour, label=name)
+colors = ("#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2")
+for (name, curve), (_, n_episodes, _), color in zip(curves.items(), settings.values(), colors, strict=True):
+    ax.semilogx(n_episodes * np.arange(1, len(curve)), curve[1:], color=color, label=name)
     early = curve[40 // n_episodes]
     print(f"{name:32s} π(Right) after 40 episodes {early:.3f}, after 4,000 {curve[-1]:.4f}")
 ax.set(title="Mean of 1000 runs", xlabel="episodes", ylabel="π(Right)", ylim=(0.4, 1.02))

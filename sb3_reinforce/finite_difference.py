@@ -239,7 +239,7 @@ class FiniteDifference(BasePolicyGradient):
         Train until at least ``total_timesteps`` environment steps are made.
 
         :param total_timesteps: Environment steps, of all environments together; the last update is finished
-        :param callback: Called at each step of the environments; ``model.policy`` is then the centre θ
+        :param callback: Called at each step of the environments; ``model.policy`` is then the center θ
         :param log_interval: Updates between two entries of the log; None for no log
         :param tb_log_name: The name of the run for tensorboard; None for the name of the class
         :param reset_num_timesteps: Whether to start the counts of steps and episodes from zero

@@ -102,7 +102,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Between rollouts all environments are reset,
         unless all of them have just ended an episode. Each contributes a number of episodes fixed beforehand; steps
         beyond them are made and counted, but not used
-    :param episodes_per_start: m > 1 lets the episodes of m neighbouring environments start from the same seed, and
+    :param episodes_per_start: m > 1 lets the episodes of m neighboring environments start from the same seed, and
         ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
         much of the variance of the return lies between starts: ask ``diagnostics.compare_starts``. A rollout is then
         one episode of each environment

@@ -50,7 +50,7 @@ def counted(values: pd.Series) -> str:
 
 
 def by_task(rows: pd.DataFrame) -> Iterator[tuple[str, int, pd.DataFrame]]:
-    """The rows of each task and number of steps, where the rows of a task need not be neighbours."""
+    """The rows of each task and number of steps, where the rows of a task need not be neighbors."""
     for task, same in rows.groupby("task", sort=False):
         for budget, runs in same.groupby("budget"):
             yield str(task), int(budget), runs

@@ -110,7 +110,7 @@ def masks() -> str:
         returns = [runs[runs["timesteps"] == step]["return"] for step in steps]
         cells = [number(values.median(), 2) for values in returns[:-1]]
         lines.append([name, *cells, f"{number(returns[-1].median(), 2)} ({number(returns[-1].min(), 2)})"])
-    header = ["steps", *(str(step) for step in steps[:-1]), f"{steps[-1]} (least)"]
+    header = ["steps", *(str(step) for step in steps[:-1]), f"{steps[-1]} (min)"]
     return markdown(header, lines)
 
 
@@ -153,7 +153,7 @@ def search_throughput() -> str:
         [row["env"], row["policy"], f"{row['median']} ({row['least']}, {row['greatest']})"]
         for _, row in read("search_throughput").iterrows()
     ]
-    return markdown(["environment", "policy", "FiniteDifference / ARS: median (least, greatest)"], lines)
+    return markdown(["environment", "policy", "FiniteDifference / ARS: median (min, max)"], lines)
 
 
 def throughput() -> str:

@@ -20,7 +20,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from rliable import library, metrics
 
-from sb3_reinforce.diagnostics.plots import COLOURS, interquartile_interval
+from sb3_reinforce.diagnostics.plots import COLORS, interquartile_interval
 
 REPETITIONS = 2000
 LABELS = {
@@ -101,7 +101,7 @@ def seeds(counts: Collection[int]) -> str:
 
 
 def color(algorithm: str) -> str:
-    return COLOURS[list(LABELS).index(algorithm)] if algorithm in LABELS else "black"
+    return COLORS[list(LABELS).index(algorithm)] if algorithm in LABELS else "black"
 
 
 def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:

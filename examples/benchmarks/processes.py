@@ -212,10 +212,10 @@ def draw(rows: pd.DataFrame, n_rounds: int, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    from sb3_reinforce.diagnostics.plots import COLOURS
+    from sb3_reinforce.diagnostics.plots import COLORS
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
-    for milliseconds, color in zip(MILLISECONDS, COLOURS, strict=False):
+    for milliseconds, color in zip(MILLISECONDS, COLORS, strict=False):
         of_step = rows[rows.milliseconds == milliseconds]
         for axis, column in zip(axes, ("rate", "seconds"), strict=True):
             medians = of_step.groupby(["kind", "number"])[column].median()

@@ -56,13 +56,13 @@ def draw(rows: list[dict[str, object]], n_rounds: int, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    from sb3_reinforce.diagnostics.plots import COLOURS
+    from sb3_reinforce.diagnostics.plots import COLORS
 
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    colours = (COLOURS[0], COLOURS[1], COLOURS[0], COLOURS[1], COLOURS[2])
-    for name, style, colour in zip(CONTENDERS, (":", ":", "-o", "-o", "-s"), colours, strict=True):
+    colors = (COLORS[0], COLORS[1], COLORS[0], COLORS[1], COLORS[2])
+    for name, style, color in zip(CONTENDERS, (":", ":", "-o", "-o", "-s"), colors, strict=True):
         points = [(row["n_envs"], row["steps_per_second"]) for row in rows if row["contender"] == name]
-        axes.loglog(*zip(*points, strict=True), style, color=colour, label=name, markersize=4)
+        axes.loglog(*zip(*points, strict=True), style, color=color, label=name, markersize=4)
     axes.set(
         title=f"Speed by number of environments: medians of {n_rounds} rounds",
         xlabel="copies of CartPole-v1",

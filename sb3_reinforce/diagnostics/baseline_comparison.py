@@ -181,7 +181,7 @@ def componentwise_residuals(weighted: th.Tensor, scores: th.Tensor) -> th.Tensor
     Peters and Schaal (2008), section 3.2, with sample covariances for E[A S] and E[S²], as E[S] = 0. Fitted to the
     episodes that it is applied to, the variance is too small by about 1/m.
     """
-    centred = scores - scores.mean(0)
-    squares = centred.square().sum(0)
-    best = ((weighted - weighted.mean(0)) * centred).sum(0) / squares.clamp(min=th.finfo(squares.dtype).tiny)
+    centered = scores - scores.mean(0)
+    squares = centered.square().sum(0)
+    best = ((weighted - weighted.mean(0)) * centered).sum(0) / squares.clamp(min=th.finfo(squares.dtype).tiny)
     return weighted - best * scores

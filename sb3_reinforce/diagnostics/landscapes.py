@@ -40,7 +40,7 @@ class CandidateUtility:
         self.model = model
         self.env = env_of(model)
         self.n_episodes = check_integer("n_episodes", n_episodes, 1)
-        # Were it the first seed, neighbouring seeds would share nearly all of their episodes
+        # Were it the first seed, neighboring seeds would share nearly all of their episodes
         self.seed = int(np.random.default_rng(check_integer("seed", seed, 0)).integers(2**31))
         self.n_steps = 0
         #: A bar of tqdm that counts episodes, or None

@@ -26,8 +26,8 @@ from sb3_reinforce.estimation.returns import Floats
 
 __all__ = ["plot_baselines", "plot_landscape", "plot_learning_curves", "plot_variances"]
 
-# Distinguishable with any colour vision (Okabe and Ito, 2008)
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+# Distinguishable with any color vision (Okabe and Ito, 2008)
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 # Visible on the greys of a landscape, and apart from each other
 ON_LANDSCAPE = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7")
 # For greyscale prints
@@ -66,13 +66,13 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]
     for y, row in enumerate(rows):
-        fill = COLOURS[0] if row.bias == 0 else "white"
-        ax.hlines(y, row.ratio.low, row.ratio.high, color=COLOURS[0], linewidth=2)
-        ax.plot(row.ratio.value, y, linestyle="", marker=MARKERS[0], color=COLOURS[0], markerfacecolor=fill)
+        fill = COLORS[0] if row.bias == 0 else "white"
+        ax.hlines(y, row.ratio.low, row.ratio.high, color=COLORS[0], linewidth=2)
+        ax.plot(row.ratio.value, y, linestyle="", marker=MARKERS[0], color=COLORS[0], markerfacecolor=fill)
     ax.set_yticks(range(len(rows)), [row.baseline for row in rows])
-    ax.axvline(table["floor"].ratio.value, color=COLOURS[3], linestyle="--", label="floor")
-    ax.plot([], linestyle="", marker=MARKERS[0], color=COLOURS[0], label="unbiased")
-    ax.plot([], linestyle="", marker=MARKERS[0], color=COLOURS[0], markerfacecolor="white", label="biased, or unknown")
+    ax.axvline(table["floor"].ratio.value, color=COLORS[3], linestyle="--", label="floor")
+    ax.plot([], linestyle="", marker=MARKERS[0], color=COLORS[0], label="unbiased")
+    ax.plot([], linestyle="", marker=MARKERS[0], color=COLORS[0], markerfacecolor="white", label="biased, or unknown")
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.set_xlim(left=0)
@@ -138,7 +138,7 @@ def plot_learning_curves(
         curve, low, high = interquartile_interval(
             scores.reshape(len(scores), -1, x.size), n_resamples, confidence, seed
         )
-        (line,) = ax.plot(x, curve, color=COLOURS[index % len(COLOURS)], label=f"{name} ({len(scores)} runs)")
+        (line,) = ax.plot(x, curve, color=COLORS[index % len(COLORS)], label=f"{name} ({len(scores)} runs)")
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2)
     ax.set(xlabel="environment steps", ylabel="interquartile mean of the return", title="Learning curves")
     ax.legend(title=f"bands: {confidence:.0%} bootstrap intervals")
@@ -180,10 +180,10 @@ def plot_variances(
         width = student_t.ppf((1 + confidence) / 2, len(variances) - 1)
         error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
         shifted = x * 1.05 ** (index - (len(curves) - 1) / 2)
-        colour = COLOURS[index % len(COLOURS)]
+        color = COLORS[index % len(COLORS)]
         marker = MARKERS[index % len(MARKERS)]
         mean = variances.mean(axis=0)
-        ax.errorbar(shifted, mean, width * error, color=colour, marker=marker, markersize=5, linewidth=1, label=name)
+        ax.errorbar(shifted, mean, width * error, color=color, marker=marker, markersize=5, linewidth=1, label=name)
     ax.set(xscale="log", yscale="log", xlabel="episodes per gradient", ylabel="variance (trace of the covariance)")
     ax.set_title("Variance of the gradient: means of the repetitions")
     ax.set_xticks(x, [f"{episodes:g}" for episodes in x])
@@ -204,7 +204,7 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     """
     check_kind("scape", scape, (Landscape,))
     ax = new_axes(ax, (6.0, 6.6))
-    # Half a step beyond the outer points, which are the centres of pixels
+    # Half a step beyond the outer points, which are the centers of pixels
     end = scape.scales[-1] * (1 + 1 / (len(scape.scales) - 1))
     # Interpolated between the points, where contours of noisy utilities would be ragged
     square = (-end, end, -end, end)
@@ -213,8 +213,8 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     for index, (name, steps) in enumerate(scape.steps.items()):
         # The lengths differ by estimator, so that no fan hides another
         x, y = np.atleast_2d(steps).T * (0.9 - 0.6 * index / len(scape.steps))
-        colour = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
-        arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=colour)
+        color = ON_LANDSCAPE[index % len(ON_LANDSCAPE)]
+        arrows = ax.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, width=0.009, color=color)
         arrows.set(label=f"{name} ({len(x)})", edgecolor="black", linewidth=0.4)
     ax.plot(0, 0, marker="o", color="white", markeredgecolor="black", zorder=3)
     points = f"{len(scape.scales)} × {len(scape.scales)} points of {scape.n_episodes} episodes"

@@ -152,8 +152,8 @@ def share_between(returns: th.Tensor, counts: th.Tensor) -> th.Tensor:
 
     The means of k episodes vary by ``σ²_between + σ²_within / k`` (Searle, Casella and McCulloch, 1992, chapter 3).
     """
-    centred = without_rounding(returns - returns.mean(), returns.abs().max())
-    means = centred.mean(1)
-    within = counts @ centred.var(1) / counts.sum(1)
+    centered = without_rounding(returns - returns.mean(), returns.abs().max())
+    means = centered.mean(1)
+    within = counts @ centered.var(1) / counts.sum(1)
     between = (variance(compute_moments(means[:, None] * means, counts)) - within / returns.shape[1]).clamp(min=0)
     return between / (between + within)

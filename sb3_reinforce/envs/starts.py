@@ -51,7 +51,7 @@ def cannot_seed(base: Any) -> ValueError:
 
 
 def start_groups(env: VecEnv, size: int) -> Any:
-    """First observations; each group of ``size`` neighbouring environments shares a start."""
+    """First observations; each group of ``size`` neighboring environments shares a start."""
     seeds = th.randint(2**31, (env.num_envs // size,)).numpy().repeat(size)
     # Pending seeds would replace these. VecNormalize need not know of this reset
     base_of(env).reset()
@@ -82,13 +82,13 @@ def reseed(env: VecEnv, seed: int) -> None:
 
 
 def are_alike(obs: Any, size: int) -> bool:
-    """Whether the observations of each ``size`` neighbours are equal."""
+    """Whether the observations of each ``size`` neighbors are equal."""
     parts = obs.values() if isinstance(obs, dict) else [obs]
     return all(np.array_equal(part, part[::size].repeat(size, axis=0)) for part in parts)
 
 
 def check_groups(obs: Any, size: int) -> None:
-    """Refuse first observations that differ between ``size`` neighbours, which had the same seed."""
+    """Refuse first observations that differ between ``size`` neighbors, which had the same seed."""
     check_finite("The observation", obs, (None,))
     if not are_alike(obs, size):
         raise ValueError(

@@ -122,10 +122,10 @@ def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
         weights = rollout.discounts * (rollout.returns - level)
         weighted, scores = gradients_by_episode(part, weights, rollout.discounts)
         products[group] = th.stack([(weighted * scores).sum(1), scores.square().sum(1)], dim=1).cpu().double()
-    centred, squares = products.T
+    centered, squares = products.T
     levels = th.zeros_like(squares)
     levels[rollout.episodes] = level
-    return centred + levels * squares, squares
+    return centered + levels * squares, squares
 
 
 def sum_of_others(x: th.Tensor) -> th.Tensor:

@@ -1,7 +1,7 @@
 """
 Gradients of a utility from its values alone.
 
-An estimator is one function ``(U, θ, Δ) -> ĝ``: the utility, the centre of shape ``(n,)`` and the perturbations of
+An estimator is one function ``(U, θ, Δ) -> ĝ``: the utility, the center of shape ``(n,)`` and the perturbations of
 shape ``(k, n)``. All three here are one least-squares problem, ``design · ĝ ≈ differences``, with different designs.
 Everything is float64, since differences of nearly equal numbers are taken.
 
@@ -167,7 +167,7 @@ def fit_quality(
     candidates: th.Tensor, utilities: th.Tensor, gradient: th.Tensor, columns: th.Tensor | None = None
 ) -> Fit:
     """
-    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − c − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centred θ + δ.
+    ``R² = 1 − Σ r² / Σ (U − Ū)²``, ``s² = Σ r² / (m − c − rank)`` and ``s √diag((XᵀX)⁻¹)``, with X the centered θ + δ.
 
     Each of the c columns has its mean and its intercept u₀: candidates that met other episodes are not compared.
 
@@ -179,8 +179,8 @@ def fit_quality(
     """
     if columns is None:
         columns = th.zeros(len(utilities), dtype=th.long)
-    x = centred(candidates, columns)
-    y = centred(utilities[:, None], columns)[:, 0]
+    x = centered(candidates, columns)
+    y = centered(utilities[:, None], columns)[:, 0]
     residuals = y - x @ gradient
     # Both products have the rank of x; the smaller one is cheaper
     product = x @ x.T if len(x) < len(gradient) else x.T @ x
@@ -198,7 +198,7 @@ def fit_quality(
     )
 
 
-def centred(x: th.Tensor, columns: th.Tensor) -> th.Tensor:
+def centered(x: th.Tensor, columns: th.Tensor) -> th.Tensor:
     """Rows ``(m, n)`` less the mean of their column."""
     counts = columns.bincount()
     sums = x.new_zeros(len(counts), x.shape[1]).index_add_(0, columns, x)

@@ -38,7 +38,7 @@ class Rollout:
     :param next_values: V(s_{t+1}), which is 0 after a terminal state, float64; None without ``baseline="value"``
     :param state: The state of a recurrent policy before the first step, shape
         ``(n_envs, 2, 2, n_layers, n_hidden)`` for actor and critic, hidden and cell state; None if all start from zero
-    :param episodes_per_start: The number of neighbouring environments whose episodes start alike; 1 if all differ
+    :param episodes_per_start: The number of neighboring environments whose episodes start alike; 1 if all differ
     """
 
     observations: PyTorchObs

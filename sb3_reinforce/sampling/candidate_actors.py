@@ -47,7 +47,7 @@ class LoopActor:
     @uninterrupted
     def act(self, obs: Any) -> np.ndarray:
         """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
-        centre = to_vector(self.searched)
+        center = to_vector(self.searched)
         attributes = vars(self.policy.action_dist)
         noise: dict[str, Any] = {name: attributes[name] for name in MATRICES if name in attributes}
         actions = []
@@ -60,7 +60,7 @@ class LoopActor:
                 action, _ = self.policy.predict(take(obs, slice(i, i + 1)), deterministic=self.deterministic)
                 actions.append(action)
         finally:
-            parameters.write(self.searched, centre)
+            parameters.write(self.searched, center)
             attributes.update(noise)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 

@@ -52,7 +52,7 @@ class Extent:
 
     @classmethod
     def whole_episodes(cls, n_episodes: int, n_envs: int, max_episode_steps: int) -> "Extent":
-        """Quotas that differ by at most 1, fixed beforehand: "the first to finish" would favour short episodes."""
+        """Quotas that differ by at most 1, fixed beforehand: "the first to finish" would favor short episodes."""
         quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
         return cls(quota, max_episode_steps=max_episode_steps)
 

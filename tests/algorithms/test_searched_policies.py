@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import FiniteDifference
 
 
-def test_a_callback_finds_the_centre_in_the_policy_and_can_stop_at_any_step():
+def test_a_callback_finds_the_center_in_the_policy_and_can_stop_at_any_step():
     model = make(make_vec_env("CartPole-v1", 4))
     theta, thetas = model.theta, Record(lambda model: model.theta, at="step")
     model.learn(10_000, [thetas, At(7)])

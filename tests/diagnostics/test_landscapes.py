@@ -171,7 +171,7 @@ class Seeds(Corridor):
         return super().reset(seed=seed, options=options)
 
 
-def test_neighbouring_seeds_share_no_episodes():
+def test_neighboring_seeds_share_no_episodes():
     played = []
     for seed in (0, 1):
         env = Seeds()
