@@ -129,6 +129,11 @@ def evaluate(
         entropy = distribution.entropy()
         if with_values:
             values = policy.sequence_values(obs) if isinstance(policy, RecurrentPolicy) else policy.predict_values(obs)
+    if log_prob.dim() != 1:
+        raise ValueError(
+            f"log π of {type(policy).__name__} must have shape (n,), got {tuple(log_prob.shape)}: sum it over the "
+            "dimensions of the action"
+        )
     if entropy is None:
         # H = −E[log π], ∇H = −E[log π ∇ log π]
         constant = log_prob.detach()
@@ -178,8 +183,9 @@ def leave_no_graph(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> N
 
 
 def trainable(policy: ActorCriticPolicy) -> Parameters:
-    """The parameters that are trained, in the policy's order."""
-    return [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    """The parameters that are trained, which are those that the policy's optimizer holds, in the policy's order."""
+    held = {parameter for group in policy.optimizer.param_groups for parameter in group["params"]}
+    return [parameter for parameter in policy.parameters() if parameter.requires_grad and parameter in held]
 
 
 def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:

@@ -99,7 +99,14 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
         now: Any = copy.copy(action_distribution(policy, obs))
 
     def divergence() -> th.Tensor:
-        kl = kl_divergence(now, action_distribution(policy, obs))
+        other = action_distribution(policy, obs)
+        try:
+            kl = kl_divergence(now, other)
+        except (NotImplementedError, AttributeError, AssertionError) as error:
+            raise ValueError(
+                f"step='natural' needs the KL divergence of the actions' distribution, and Stable-Baselines3 and "
+                f"PyTorch have none for {type(now).__name__}: use step='optimizer'"
+            ) from error
         return kl.sum() / len(kl)
 
     return divergence

@@ -5,10 +5,12 @@ import torch as th
 from callbacks import At
 from environments import Corridor
 from models import FromDistribution, all_kinds, make
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.diagnostics import compare_baselines
+from sb3_reinforce.common.tensors import to_vector
+from sb3_reinforce.diagnostics import check_gradient, compare_baselines
 
 
 class WithoutParts(FromDistribution):
@@ -29,6 +31,31 @@ class WithoutParts(FromDistribution):
 @all_kinds
 def test_a_policy_without_the_usual_parts_trains(kind):
     assert make(kind, Corridor((3,)), WithoutParts, policy_kwargs={}).learn(32)._n_updates > 0
+
+
+class NotSummed(DiagGaussianDistribution):
+    """Its log π has the shape (n, 1)."""
+
+    def log_prob(self, actions):
+        return self.distribution.log_prob(actions)
+
+
+class Column(ActorCriticPolicy):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.action_dist = NotSummed(1)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"step": "natural"}, {"baseline": "none"}], ids=str)
+def test_a_log_prob_of_the_wrong_shape_is_named(kwargs):
+    """Multiplied by n weights it would be an n × n matrix."""
+    model = REINFORCE(Column, "Pendulum-v1", max_episode_steps=200, device="cpu", **kwargs)
+    before = to_vector(model.policy.parameters())
+    sentence = r"log π of Column must have shape \(n,\), got \(\d+, 1\)"
+    for use in (lambda: model.learn(1), lambda: check_gradient(model)):
+        with pytest.raises(ValueError, match=sentence):
+            use()
+    assert th.equal(to_vector(model.policy.parameters()), before)
 
 
 class Ones(ActorCriticPolicy):

@@ -48,6 +48,37 @@ def test_a_network_may_use_a_part_of_itself_in_each_rollout(share, step):
     assert experts and experts <= moved_by_learning(model, 16)
 
 
+class HeadsOnly(ActorCriticPolicy):
+    """Leaves all layers but the last ones out of its optimizer, for example pretrained ones."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        heads = [*self.action_net.parameters(), *self.value_net.parameters()]
+        self.optimizer = self.optimizer_class(heads, lr=lr_schedule(1), **self.optimizer_kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "kwargs"),
+    [
+        ("steps", {}),
+        ("steps", {"step": "natural"}),
+        ("episodes", {}),
+        ("episodes", {"step": "natural"}),
+    ],
+)
+def test_what_the_optimizer_does_not_hold_is_not_trained(kind, kwargs):
+    """As in A2C."""
+    moved = moved_by_learning(make(kind, policy=HeadsOnly, **kwargs), 64)
+    heads = ("action_net", "value_net") if kind == "steps" else ("action_net",)
+    assert moved == {f"{head}.{name}" for head in heads for name in ("weight", "bias")}
+
+
+def test_what_the_optimizer_does_not_hold_is_not_searched():
+    model = make("search", policy=HeadsOnly)
+    assert model.n_parameters == sum(parameter.numel() for parameter in model.policy.action_net.parameters())
+    assert moved_by_learning(model, 64) == {"action_net.weight", "action_net.bias"}
+
+
 class CriticOfAll(ActorCriticPolicy):
     """V depends on all experts at each step."""
 

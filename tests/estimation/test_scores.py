@@ -78,6 +78,7 @@ class OneStd(ActorCriticPolicy):
     def _build(self, lr_schedule):
         super()._build(lr_schedule)
         self.log_std = th.nn.Parameter(th.tensor(-0.3))
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
 
 
 IMAGES = {"screen_height": 36, "screen_width": 36, "n_channels": 1, "discrete": True}
@@ -135,6 +136,7 @@ def test_layers_that_share_a_parameter():
     net = rollout.policy.mlp_extractor.policy_net
     net[0], net[2] = th.nn.Linear(9, 9), th.nn.Linear(9, 9)
     net[2].weight, rollout.policy.action_net = net[0].weight, th.nn.Linear(9, 2)
+    rollout.policy.optimizer = th.optim.Adam(rollout.policy.parameters())
     assert_as_one_by_one(rollout)
 
 
