@@ -1,7 +1,7 @@
 """
 How does throughput grow with the number of environments, and how far is it from the environments alone?
 
-CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorisation
+CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorization
 through ``GymnasiumVecEnv``, and the ``step`` of both VecEnvs with no learner. Writes a CSV, and with matplotlib the
 picture.
 

@@ -20,7 +20,7 @@ from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import first_step, gradient_blocks, parameters_of
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import leave_no_graph, log_prob_of, temperature_of, trainable
+from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph, log_prob_of, temperature_of
 from sb3_reinforce.policies.parameters import evaluation_mode
 
 # The printed log shows names of up to 24 characters in full, and of longer ones this many and three dots
@@ -197,11 +197,11 @@ class PitfallCallback(Diagnosis):
         self.temperature = temperature_of(policy)
         log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)
-        if log_prob.requires_grad:
+        if log_prob.requires_grad and (parameters := actor_parameters(policy, *first_step(rollout))):
             weights = select(training_weights(self.model), rollout.used).to(log_prob)
-            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), trainable(policy), allow_unused=True))
+            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
-            leave_no_graph(policy, *first_step(rollout))
+        leave_no_graph(policy, *first_step(rollout))
 
     def _on_rollout_start(self) -> None:
         self._examine()

@@ -28,9 +28,9 @@ __all__ = ["plot_baselines", "plot_landscape", "plot_learning_curves", "plot_var
 
 # Distinguishable with any color vision (Okabe and Ito, 2008)
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-# Visible on the greys of a landscape, and apart from each other
+# Visible on the grays of a landscape, and apart from each other
 ON_LANDSCAPE = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7")
-# For greyscale prints
+# For grayscale prints
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
@@ -195,7 +195,7 @@ def plot_variances(
 
 def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     """
-    Plot U(θ) on a plane through θ in greys, and the gradients as arrows: several of one estimator are a fan.
+    Plot U(θ) on a plane through θ in grays, and the gradients as arrows: several of one estimator are a fan.
 
     :param scape: The result of ``landscape``
     :param ax: Axes to draw on; None for new ones

@@ -136,7 +136,8 @@ def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
     if not parameters:
         raise ValueError(
             f"log π of {type(policy).__name__} cannot be differentiated: it depends on none of the policy's "
-            f"{len(trainable(policy))} trainable parameters (is it computed under no_grad, or detached?)"
+            f"{len(trainable(policy))} trainable parameters (is it computed under no_grad, or detached, or does "
+            "policy.optimizer not hold them?)"
         )
     return parameters
 

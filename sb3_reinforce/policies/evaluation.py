@@ -204,7 +204,7 @@ def reached_by(compute: Callable[[], th.Tensor], parameters: Parameters) -> Para
     # A compiled network has gradients of 0 instead of None
     with th.compiler.set_stance("force_eager"):
         output = compute()
-        if not output.requires_grad:
+        if not (parameters and output.requires_grad):
             return []
         gradients = th.autograd.grad(output.sum(), parameters, allow_unused=True)
     return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]

@@ -17,7 +17,7 @@ class ParameterGroups:
     """
 
     def __init__(self) -> None:
-        self.sorted_for: tuple[tuple[int, bool], ...] = ()
+        self.sorted_for: tuple[int, ...] = ()
         self.of_actor: set[th.nn.Parameter] = set()
         self.of_critic: set[th.nn.Parameter] = set()
 
@@ -26,7 +26,7 @@ class ParameterGroups:
     ) -> tuple[Parameters, Parameters, Parameters]:
         """The trainable parameters of actor, critic alone and both, in the policy's order."""
         parameters = trainable(policy)
-        present = tuple((id(parameter), parameter.requires_grad) for parameter in policy.parameters())
+        present = tuple(map(id, parameters))
         if self.sorted_for != present:
             self.sorted_for = present
             self.of_actor = set()

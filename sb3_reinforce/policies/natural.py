@@ -104,8 +104,8 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
             kl = kl_divergence(now, other)
         except (NotImplementedError, AttributeError, AssertionError) as error:
             raise ValueError(
-                f"step='natural' needs the KL divergence of the actions' distribution, and Stable-Baselines3 and "
-                f"PyTorch have none for {type(now).__name__}: use step='optimizer'"
+                "step='natural' needs a KL divergence between the distributions of the actions, and Stable-Baselines3 "
+                f"and PyTorch compute none for {type(now).__name__}: use step='optimizer'"
             ) from error
         return kl.sum() / len(kl)
 

@@ -10,7 +10,7 @@ from models import Experts, Normalized, Scaled, all_kinds, both_extents, make, m
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.diagnostics import check_gradient, compare_baselines
+from sb3_reinforce.diagnostics import PitfallCallback, check_gradient, compare_baselines
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 
@@ -53,7 +53,7 @@ class HeadsOnly(ActorCriticPolicy):
 
     def _build(self, lr_schedule):
         super()._build(lr_schedule)
-        heads = [*self.action_net.parameters(), *self.value_net.parameters()]
+        heads = [{"params": head.parameters()} for head in (self.action_net, self.value_net)]
         self.optimizer = self.optimizer_class(heads, lr=lr_schedule(1), **self.optimizer_kwargs)
 
 
@@ -263,17 +263,30 @@ def test_a_callback_finds_the_gradients_of_the_last_update():
     assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-5)
 
 
-def test_the_critic_trains_a_shared_extractor_that_was_frozen_at_first():
+@pytest.mark.parametrize("policy", ["MlpPolicy", HeadsOnly])
+def test_the_critic_trains_a_shared_extractor_that_was_frozen_at_first(policy):
     ends = []
     for vf_coef in (0.0, 0.25):
         kwargs = {"features_extractor_class": Scaled, "net_arch": [4]}
-        model = make("steps", vf_coef=vf_coef, max_grad_norm=None, policy_kwargs=kwargs, seed=0)
-        scale = model.policy.features_extractor.scale.requires_grad_(False)
+        model = make("steps", policy=policy, vf_coef=vf_coef, max_grad_norm=None, policy_kwargs=kwargs, seed=0)
+        scale = model.policy.features_extractor.scale.requires_grad_(policy is HeadsOnly)
         model.learn(8)
+        if policy is HeadsOnly:
+            model.policy.optimizer.add_param_group({"params": [scale]})
         scale.requires_grad_()
         model.learn(8, reset_num_timesteps=False)
         ends.append(scale.grad)
     assert not th.allclose(*ends)
+
+
+@pytest.mark.parametrize(("kind", "kwargs"), [("steps", {}), ("episodes", {"step": "natural"})])
+def test_an_optimizer_of_the_critic_alone_trains_no_actor(kind, kwargs):
+    model = make(kind, **kwargs)
+    model.policy.optimizer = th.optim.Adam(model.policy.value_net.parameters())
+    assert "action_net.weight" not in moved_by_learning(model, 32)
+    model.learn(32, PitfallCallback())
+    with pytest.raises(ValueError, match=r"does policy\.optimizer not hold them"):
+        check_gradient(model)
 
 
 def test_each_pass_of_the_critic_draws_all_steps_in_a_new_order():

@@ -357,7 +357,24 @@ class OtherName(DiagGaussianDistribution):
         return self.normal.sample()
 
 
-@pytest.mark.parametrize("distribution", [HeavyTailed, OtherName])
+class Parts(DiagGaussianDistribution):
+    """Keeps PyTorch's distribution in a list."""
+
+    def proba_distribution(self, mean_actions, log_std):
+        self.distribution = [super().proba_distribution(mean_actions, log_std).distribution]
+        return self
+
+    def log_prob(self, actions):
+        return self.distribution[0].log_prob(actions).sum(1)
+
+    def entropy(self):
+        return self.distribution[0].entropy().sum(1)
+
+    def sample(self):
+        return self.distribution[0].sample()
+
+
+@pytest.mark.parametrize("distribution", [HeavyTailed, OtherName, Parts])
 def test_a_distribution_without_a_divergence_is_refused(distribution):
     class Own(ActorCriticPolicy):
         def __init__(self, *args, **kwargs):
@@ -368,7 +385,7 @@ def test_a_distribution_without_a_divergence_is_refused(distribution):
         model = REINFORCE(Own, "Pendulum-v1", step=step, n_steps=32, seed=0, device="cpu")
         before = to_vector(model.policy.parameters())
         if step == "natural":
-            with pytest.raises(ValueError, match=f"have none for {distribution.__name__}: use"):
+            with pytest.raises(ValueError, match=f"compute none for {distribution.__name__}: use"):
                 model.learn(32)
         else:
             model.learn(32)
