@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from environments import Random
 from gymnasium import spaces
+from sb3_contrib import TRPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -17,6 +18,7 @@ ALGORITHMS = {
     "search": (FiniteDifference, {"n_delta": 4, "estimator": "central", "deterministic": False}),
     "a2c": (A2C, {"n_steps": 16}),
     "ppo": (PPO, {"n_steps": 64, "batch_size": 64, "n_epochs": 2}),
+    "trpo": (TRPO, {"n_steps": 16, "batch_size": 16}),
     "recurrent": (RecurrentREINFORCE, {"n_steps": 16}),
 }
 VECTOR = spaces.Box(-1, 1, (3,))

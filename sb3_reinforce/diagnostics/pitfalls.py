@@ -202,8 +202,8 @@ def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
         return min(1.0, std / half_width)
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
-        # Of a policy that prefers none of the actions that a mask allows
-        largest = float(sum(part.logits.isfinite().sum(-1).log().mean() for part in parts))
+        # Of a policy that prefers none of the actions that a mask allows. No network gives logits as low as a mask's
+        largest = float(sum((part.logits > -1e7).sum(-1).log().mean() for part in parts))
     else:
         largest = math.log(2) * math.prod(space.shape or ())
     return entropy / largest if largest > 0 else math.nan

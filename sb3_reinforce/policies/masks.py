@@ -26,6 +26,8 @@ from torch import nn
 KEY = "action_mask"
 # The key of an observation that was no dict before the mask was added
 OBSERVATION = "observation"
+# The logit of a masked action: its probability is 0 at any temperature. With −∞ a divergence's gradient can be NaN
+FORBIDDEN = -1e30
 
 Part = TypeVar("Part")
 
@@ -157,7 +159,7 @@ class MaskedMlpExtractor(nn.Module):
 
 
 class MaskedLogits(nn.Module):
-    """``logits(s, a)`` where a is allowed, else −∞; in a dimension where nothing is allowed, all is."""
+    """``logits(s, a)`` where a is allowed, else ``FORBIDDEN``; in a dimension where nothing is allowed, all is."""
 
     def __init__(self, action_net: nn.Module, sizes: list[int]):
         super().__init__()
@@ -169,16 +171,17 @@ class MaskedLogits(nn.Module):
         # Else π would be NaN in terminal states, and for the zeros by which a policy is probed
         allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), self.sizes, dim=-1)]
         logits: th.Tensor = self.action_net(latent)
-        return logits.masked_fill(~th.cat(allowed, dim=-1), -th.inf)
+        return logits.masked_fill(~th.cat(allowed, dim=-1), FORBIDDEN)
 
 
 class MaskedPolicy(ActorCriticPolicy):
     """
-    An ``ActorCriticPolicy`` that never takes a masked action, for REINFORCE, FiniteDifference, A2C and PPO.
+    An ``ActorCriticPolicy`` that never takes a masked action, for REINFORCE, FiniteDifference, A2C, PPO and TRPO.
 
     π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
     log π, its gradient and the entropy belong to that distribution. Where nothing is allowed, as in terminal states,
-    all actions are. The critic and the features do not see the mask. A2C and PPO need action spaces that start at 0.
+    all actions are. The critic and the features do not see the mask. A2C, PPO and TRPO need action spaces that start
+    at 0.
 
     :param observation_space: A ``Dict`` with the key ``"action_mask"`` and at least one more
     :param action_space: ``Discrete`` or ``MultiDiscrete``
