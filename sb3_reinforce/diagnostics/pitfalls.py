@@ -15,8 +15,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_reinforce.common.settings import MAX_TEMPERATURE
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
 from sb3_reinforce.policies.evaluation import action_distribution
+from sb3_reinforce.policies.masks import FORBIDDEN
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -202,8 +204,9 @@ def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
         return min(1.0, std / half_width)
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
-        # Of a policy that prefers none of the actions that a mask allows. No network gives logits as low as a mask's
-        largest = float(sum((part.logits > -1e7).sum(-1).log().mean() for part in parts))
+        # Of a policy that prefers none of the actions that a mask allows
+        masked = FORBIDDEN / MAX_TEMPERATURE / 2
+        largest = float(sum((part.logits > masked).sum(-1).log().mean() for part in parts))
     else:
         largest = math.log(2) * math.prod(space.shape or ())
     return entropy / largest if largest > 0 else math.nan

@@ -54,6 +54,8 @@ rewarded = partial(partial, Corridor)
 whole = {"baseline": "none", "n_episodes": 1}
 flat_critic = {"critic_learning_rate": 0.0, "change": lambda policy: policy.value_net.weight.mul_(20)}
 one_action = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([9.0, 0.0]))}
+# As of a linear policy of large observations
+certain = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([1e9, 0.0]))}
 narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
 
 
@@ -66,6 +68,7 @@ TASKS = [
     ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
     ("useless_critic", "n_critic_updates", rewarded((4,), noise), 8000, flat_critic),
     ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, one_action),
+    ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, certain),
     ("deterministic_too_early", "min_std", rewarded((4,), action_space=BOX), 640, narrow),
     ("cut_episodes", "n_episodes", rewarded((3, 7)), 100, {"n_steps": 10, "baseline": "mean"}),
 ]
