@@ -54,7 +54,7 @@ rewarded = partial(partial, Corridor)
 whole = {"baseline": "none", "n_episodes": 1}
 flat_critic = {"critic_learning_rate": 0.0, "change": lambda policy: policy.value_net.weight.mul_(20)}
 one_action = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([9.0, 0.0]))}
-# As of a linear policy of large observations
+# As in a linear policy with large observations
 certain = {"change": lambda policy: policy.action_net.bias.copy_(th.tensor([1e9, 0.0]))}
 narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
 
