@@ -58,7 +58,8 @@ class EpisodeTracker:
         if self.clock > self.deadline:
             raise ValueError(
                 f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps: give the "
-                "environment a time limit, or raise max_episode_steps. The parameters have not changed."
+                "environment a time limit, or raise max_episode_steps. An EvalCallback needs other environments. "
+                "The parameters have not changed."
             )
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:

@@ -61,7 +61,8 @@ class Extent:
         if n_steps == self.deadline:
             raise ValueError(
                 f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and whole episodes "
-                "are waited for: give the environment a time limit, raise max_episode_steps, or, to train, set n_steps"
+                "are waited for: give the environment a time limit, raise max_episode_steps, or, to train, set "
+                "n_steps. An EvalCallback needs other environments"
             )
 
     def count(self, dones: Bools, n_steps: int) -> list[int]:
@@ -108,9 +109,8 @@ def collect(
             policy.reset_noise(env.num_envs)
         actions, values, log_probs = actor.act(model._last_obs)
         write_step(rollout_buffer, n_steps, model._last_obs, actions, values, log_probs)
-        if model.use_sde:
-            # Its standard deviation may overflow, and the environment would be blamed
-            check_finite("The action", actions, (None,))
+        # The environment would be blamed for what it does with NaN
+        check_finite("The action", actions, (None,))
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs

@@ -121,6 +121,31 @@ def test_actions_that_are_not_finite_are_not_blamed_on_the_environment(kind, wra
         model.learn(400)
 
 
+class Suffering(Wrapper):
+    """An observation becomes NaN once, and actions that are NaN spoil the rewards."""
+
+    n_steps = 0
+
+    def step_wait(self):
+        obs, *rest = self.venv.step_wait()
+        self.n_steps += 1
+        if self.n_steps == 5:
+            obs[1, 0] = NAN
+        return obs, *rest
+
+    def step_async(self, actions):
+        assert np.isfinite(actions).all()
+        self.venv.step_async(actions)
+
+
+@both_extents
+@pytest.mark.parametrize("wrapper", [Suffering, lambda env: VecFrameStack(Suffering(env), 2)])
+def test_an_observation_that_is_not_finite_leads_to_no_action(kind, wrapper):
+    model = make(kind, wrapper(make_vec_env("Pendulum-v1", 2)))
+    with pytest.raises(ValueError, match=r"observation of environment 1 at step 5 of the rollout is not finite"):
+        model.learn(800)
+
+
 class Spoiling(Wrapper):
     """Makes a reward or an observation NaN in result number ``at``, of which the first is the result of a reset."""
 
