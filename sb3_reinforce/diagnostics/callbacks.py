@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any, cast
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
@@ -39,6 +39,9 @@ class Diagnosis(BaseCallback):
         self._forget()
 
     def _init_callback(self) -> None:
+        # Which calls it within rollouts only
+        if isinstance(self.parent, EventCallback):
+            raise ValueError(f"{type(self).__name__} must be given to learn(), not to {type(self.parent).__name__}")
         if self.model is not self.last_model:
             self.last_model = self.model
             self._forget()
@@ -102,9 +105,7 @@ class GradientQualityCallback(Diagnosis):
             is_printed = any(isinstance(each, HumanOutputFormat) for each in self.logger.output_formats)
             if is_printed and len(shown) < len(self.functions):
                 names = ", ".join(self.functions)
-                raise ValueError(
-                    f"baselines must have names that differ in their first {N_SHOWN} characters, got {names}"
-                )
+                raise ValueError(f"baselines must differ in their first {N_SHOWN} characters, got {names}")
 
     def _forget(self) -> None:
         """Start with a model of which nothing is known."""
@@ -172,6 +173,7 @@ class PitfallCallback(Diagnosis):
 
     :param verbose: Verbosity level
     :raises TypeError: If the model is not a REINFORCE
+    :raises ValueError: If another callback, such as ``EveryNTimesteps``, is to call it
     """
 
     # Components of a gradient that are kept

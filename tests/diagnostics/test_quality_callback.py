@@ -4,11 +4,12 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Tree
+from stable_baselines3.common.callbacks import EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
 from sb3_reinforce import REINFORCE, FiniteDifference
-from sb3_reinforce.diagnostics import GradientQualityCallback, gradients_by_episode
+from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback, gradients_by_episode
 from sb3_reinforce.diagnostics.sampling import evenly_spread
 from sb3_reinforce.estimation.baselines import BASELINES
 
@@ -143,6 +144,14 @@ def average(name):
 def test_wrong_baselines_are_refused_before_learn_resets_its_counters(baselines, message):
     with pytest.raises((TypeError, ValueError), match=message):
         GradientQualityCallback(1, baselines)
+
+
+@pytest.mark.parametrize("callback", [GradientQualityCallback, PitfallCallback])
+def test_callbacks_that_do_not_pass_on_the_ends_of_rollouts_are_refused(callback):
+    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 2), device="cpu")
+    with pytest.raises(ValueError, match=f"{callback.__name__} must be given to learn\\(\\), not to EveryNTimesteps"):
+        model.learn(64, EveryNTimesteps(32, callback()))
+    assert model.learn(64, callback()).num_timesteps == 64
 
 
 @pytest.mark.parametrize(
