@@ -118,13 +118,17 @@ def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs,
     assert (plain_critic(model.policy) is not None) == (change in ("none", "tied") and policy is ActorCriticPolicy)
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "length"),
+    [({"critic_learning_rate": 2e-3}, "learning_rate"), ({"step": "natural"}, "target_kl")],
+)
 @both_policies
-def test_the_critic_can_learn_before_the_actor(policy):
-    model = make(policy, learning_rate=0.0, critic_learning_rate=2e-3)
+def test_the_critic_can_learn_before_the_actor(policy, kwargs, length):
+    model = make(policy, **kwargs, **{length: 0.0})
     before = {name: parameter.detach().clone() for name, parameter in model.policy.named_parameters()}
     critics = ("value_net", "mlp_extractor.value_net")
     for rate in (0.0, 2e-3):
-        model.learning_rate = rate
+        setattr(model, length, rate)
         model.learn(1)
         moved = {name for name, old in model.policy.named_parameters() if not th.equal(old, before[name])}
         assert any(name.startswith(critics) for name in moved)
