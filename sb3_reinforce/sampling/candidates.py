@@ -126,7 +126,9 @@ def evaluate_candidates(
             if started:
                 actor.assign(started, thetas[[tracker.pairs[i][0] for i in started]])
                 started = []
-            obs, rewards, dones, infos = env.step(actor.act(obs))
+            actions = actor.act(obs)
+            check_finite("The action", actions, (None,))
+            obs, rewards, dones, infos = env.step(actions)
             tracker.add(rewards if original is None else original(), obs)
             # Some VecEnvs give numbers
             dones = np.asarray(dones, dtype=bool)

@@ -6,6 +6,7 @@ from copy import deepcopy
 import cloudpickle
 import numpy as np
 import pytest
+import torch as th
 from callbacks import At
 from environments import Faulty, Wrapper, of_two
 from gymnasium import spaces
@@ -15,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
+from sb3_reinforce import FiniteDifference
 from sb3_reinforce.envs.checks import BadData, check_finite
 
 NAN, INF = float("nan"), float("inf")
@@ -126,16 +128,16 @@ class Suffering(Wrapper):
 
     n_steps = 0
 
+    def step_async(self, actions):
+        self.is_spoiled = np.isnan(actions).any(axis=1)
+        self.venv.step_async(np.nan_to_num(actions))
+
     def step_wait(self):
-        obs, *rest = self.venv.step_wait()
+        obs, rewards, *rest = self.venv.step_wait()
         self.n_steps += 1
         if self.n_steps == 5:
             obs[1, 0] = NAN
-        return obs, *rest
-
-    def step_async(self, actions):
-        assert np.isfinite(actions).all()
-        self.venv.step_async(actions)
+        return obs, np.where(self.is_spoiled, NAN, rewards), *rest
 
 
 @both_extents
@@ -143,6 +145,25 @@ class Suffering(Wrapper):
 def test_an_observation_that_is_not_finite_leads_to_no_action(kind, wrapper):
     model = make(kind, wrapper(make_vec_env("Pendulum-v1", 2)))
     with pytest.raises(ValueError, match=r"observation of environment 1 at step 5 of the rollout is not finite"):
+        model.learn(800)
+
+
+class Huge(Wrapper):
+    """Observations whose weighted sums overflow."""
+
+    def reset(self):
+        return np.full_like(self.venv.reset(), 3e38)
+
+    def step_wait(self):
+        obs, *rest = self.venv.step_wait()
+        return np.full_like(obs, 3e38), *rest
+
+
+def test_a_search_finds_actions_that_are_not_finite():
+    env = Huge(make_vec_env("Pendulum-v1", 2))
+    kwargs = {"estimator": "central", "delta_std": 1.0, "policy_kwargs": {"activation_fn": th.nn.ReLU}}
+    model = FiniteDifference("MlpPolicy", env, seed=0, device="cpu", **kwargs)
+    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(ValueError, match="The action of environment"):
         model.learn(800)
 
 
