@@ -4,15 +4,15 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Iterable
-from typing import Any, cast
+from typing import cast
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import check_critic, functions_of, weights_by
+from sb3_reinforce.diagnostics.diagnosis import Diagnosis
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
@@ -25,32 +25,6 @@ from sb3_reinforce.policies.parameters import evaluation_mode
 
 # The printed log shows names of up to 24 characters in full, and of longer ones this many and three dots
 N_SHOWN = 21
-
-
-class Diagnosis(BaseCallback):
-    """Keeps what it knows of a model from one ``learn()`` to the next, but not for another model."""
-
-    # A REINFORCE; GradientQualityCallback takes a FiniteDifference too
-    model: Any
-
-    def __init__(self, verbose: int = 0):
-        super().__init__(verbose)
-        self.last_model: Any = None
-        self._forget()
-
-    def _init_callback(self) -> None:
-        # Which calls it within rollouts only
-        if isinstance(self.parent, EventCallback):
-            raise ValueError(f"{type(self).__name__} must be given to learn(), not to {type(self.parent).__name__}")
-        if self.model is not self.last_model:
-            self.last_model = self.model
-            self._forget()
-
-    def _forget(self) -> None:
-        """Start with a model of which nothing is known."""
-
-    def _on_step(self) -> bool:
-        return True
 
 
 class GradientQualityCallback(Diagnosis):
@@ -81,7 +55,8 @@ class GradientQualityCallback(Diagnosis):
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
-        lacks, if the printed log would cut two names to the same one, or if the model's episodes share gSDE's noise
+        lacks, if the printed log would cut two names to the same one, if the model's episodes share gSDE's noise, or
+        if another callback, such as ``EveryNTimesteps``, is to call it
     """
 
     def __init__(

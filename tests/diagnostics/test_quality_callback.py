@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Tree
-from stable_baselines3.common.callbacks import EveryNTimesteps
+from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
@@ -149,9 +149,13 @@ def test_wrong_baselines_are_refused_before_learn_resets_its_counters(baselines,
 @pytest.mark.parametrize("callback", [GradientQualityCallback, PitfallCallback])
 def test_callbacks_that_do_not_pass_on_the_ends_of_rollouts_are_refused(callback):
     model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 2), device="cpu")
-    with pytest.raises(ValueError, match=f"{callback.__name__} must be given to learn\\(\\), not to EveryNTimesteps"):
-        model.learn(64, EveryNTimesteps(32, callback()))
-    assert model.learn(64, callback()).num_timesteps == 64
+    own = callback()
+    message = rf"{callback.__name__} must be given to learn\(\), not to EveryNTimesteps"
+    for called in (own, CallbackList([own])):
+        with pytest.raises(ValueError, match=message):
+            model.learn(64, EveryNTimesteps(32, called))
+    for called in (own, CallbackList([own])):
+        assert model.learn(64, called).num_timesteps == 64
 
 
 @pytest.mark.parametrize(
