@@ -100,8 +100,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Between rollouts all environments are reset,
-        unless all of them have just ended an episode. Each contributes a number of episodes fixed beforehand, which is 0
-        for some if there are more environments; steps beyond them are made and counted, but not used
+        unless all of them have just ended an episode. Each contributes a number of episodes fixed beforehand, some none
+        if there are more environments than episodes; steps beyond them are made and counted, but not used
     :param episodes_per_start: m > 1 lets the episodes of m neighboring environments start from the same seed, and
         ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
         much of the variance of the return lies between starts: ask ``diagnostics.compare_starts``. A rollout is then
