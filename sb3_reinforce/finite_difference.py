@@ -43,7 +43,6 @@ from sb3_reinforce.estimation.perturbations import (
 )
 from sb3_reinforce.estimation.weights import ROUNDING
 from sb3_reinforce.policies import parameters
-from sb3_reinforce.policies.evaluation import trainable
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.sampling.normalization import check_scale, frozen
@@ -173,8 +172,6 @@ class FiniteDifference(BasePolicyGradient):
         self.max_episode_steps = max_episode_steps
         self.is_collecting = False
         self._generator: th.Generator | None = None
-        self._trainable: list[th.nn.Parameter] = []
-        self._searched: list[th.nn.Parameter] = []
         if _init_setup_model:
             self._setup_model()
 
@@ -209,20 +206,12 @@ class FiniteDifference(BasePolicyGradient):
     @property
     def theta(self) -> th.Tensor:
         """θ, a copy of the actor's trainable parameters, shape ``(n,)``, float64."""
-        return parameters.read(self._find_parameters())
+        return parameters.read(parameters.searched_parameters(self.policy))
 
     @property
     def n_parameters(self) -> int:
         """n, the number of parameters that are searched."""
-        return sum(parameter.numel() for parameter in self._find_parameters())
-
-    def _find_parameters(self) -> list[th.nn.Parameter]:
-        """The actor's trainable parameters, found by a pass that is made again only if others are trainable now."""
-        present = trainable(self.policy)
-        if list(map(id, present)) != list(map(id, self._trainable)):
-            self._searched = parameters.searched_parameters(self.policy)
-            self._trainable = present
-        return self._searched
+        return sum(parameter.numel() for parameter in parameters.searched_parameters(self.policy))
 
     @guarded
     @together
@@ -298,7 +287,7 @@ class FiniteDifference(BasePolicyGradient):
         self.start_round()
         self.is_collecting = True
         try:
-            searched = self._find_parameters()
+            searched = parameters.searched_parameters(self.policy)
             theta = parameters.read(searched)
             n = len(theta)
             n_delta = cast(int, self.n_delta)
@@ -373,7 +362,7 @@ class FiniteDifference(BasePolicyGradient):
         self.logger.record("rollout/utility_std", utility_std)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_trainable", "_searched", "is_collecting"]
+        return [*super()._excluded_save_params(), "is_collecting"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
