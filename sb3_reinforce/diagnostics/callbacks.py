@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import cast
 
 import torch as th
-from stable_baselines3.common.logger import HumanOutputFormat
 
 from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
@@ -22,9 +21,6 @@ from sb3_reinforce.estimation.scores import first_step, gradient_blocks, paramet
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph, log_prob_of, temperature_of
 from sb3_reinforce.policies.parameters import evaluation_mode
-
-# The printed log shows names of up to 24 characters in full, and of longer ones this many and three dots
-N_SHOWN = 21
 
 
 class GradientQualityCallback(Diagnosis):
@@ -55,8 +51,8 @@ class GradientQualityCallback(Diagnosis):
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
-        lacks, if the printed log would cut two names to the same one, if the model's episodes share gSDE's noise, or
-        if another callback, such as ``EveryNTimesteps``, is to call it
+        lacks, if the model's episodes share gSDE's noise, or if another callback, such as ``EveryNTimesteps``, is to
+        call it
     """
 
     def __init__(
@@ -76,11 +72,6 @@ class GradientQualityCallback(Diagnosis):
         if not isinstance(self.model, FiniteDifference):
             check_model(self.model, independent=True)
             check_critic(self.model, self.functions)
-            shown = {name if len(name) <= N_SHOWN + 3 else name[:N_SHOWN] for name in self.functions}
-            is_printed = any(isinstance(each, HumanOutputFormat) for each in self.logger.output_formats)
-            if is_printed and len(shown) < len(self.functions):
-                names = ", ".join(self.functions)
-                raise ValueError(f"baselines must differ in their first {N_SHOWN} characters, got {names}")
 
     def _forget(self) -> None:
         """Start with a model of which nothing is known."""

@@ -156,21 +156,3 @@ def test_callbacks_that_do_not_pass_on_the_ends_of_rollouts_are_refused(callback
             model.learn(64, EveryNTimesteps(32, called))
     for called in (own, CallbackList([own])):
         assert model.learn(64, called).num_timesteps == 64
-
-
-@pytest.mark.parametrize(
-    ("names", "verbose", "is_refused"),
-    [
-        (("average_over_long_episodes_1", "average_over_long_episodes_2"), 1, True),
-        (("average_over_long_episodes_1", "average_over_long_episodes_2"), 0, False),
-        (("average_over_episodes_01", "average_over_episodes_02"), 1, False),
-    ],
-)
-def test_names_that_the_printed_log_would_cut_to_the_same_one_are_refused(names, verbose, is_refused):
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 2), verbose=verbose, device="cpu")
-    callback = GradientQualityCallback(1, [average(name) for name in names])
-    if is_refused:
-        with pytest.raises(ValueError, match="first 21 characters"):
-            model.learn(64, callback, log_interval=1)
-    else:
-        assert model.learn(64, callback, log_interval=1).num_timesteps == 64
