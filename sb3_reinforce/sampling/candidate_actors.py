@@ -21,9 +21,6 @@ from sb3_reinforce.policies.evaluation import distribution_of, extract_features
 from sb3_reinforce.policies.masks import sizes_of
 from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
-# Where the distribution of gSDE keeps its noise
-MATRICES = ("exploration_mat", "exploration_matrices")
-
 
 class LoopActor:
     """The policy's own ``predict``, in one environment after the other; a candidate is in it only while it predicts."""
@@ -48,8 +45,6 @@ class LoopActor:
     def act(self, obs: Any) -> np.ndarray:
         """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
         center = to_vector(self.searched)
-        attributes = vars(self.policy.action_dist)
-        noise: dict[str, Any] = {name: attributes[name] for name in MATRICES if name in attributes}
         actions = []
         try:
             for i, theta in enumerate(self.thetas):
@@ -61,7 +56,6 @@ class LoopActor:
                 actions.append(action)
         finally:
             parameters.write(self.searched, center)
-            attributes.update(noise)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 
 

@@ -319,10 +319,8 @@ def test_the_utility_of_a_policy_with_gsde_has_new_noise_in_each_step():
     th.nn.init.zeros_(model.policy.action_net.weight)
     for _ in range(3):
         model.policy.reset_noise(8)
-        matrices = model.policy.action_dist.exploration_matrices
         utility = CandidateUtility(model, 2000, seed=0)
         assert abs(float(utility(utility.theta[None]))) < 4.5 / 2000**0.5
-        assert model.policy.action_dist.exploration_matrices is matrices
 
 
 def test_the_likelihood_ratio_is_of_rewards_that_are_not_clipped():
