@@ -244,11 +244,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """Whether a critic is trained and used."""
         return check_function("baseline", self.baseline, BASELINES) is BASELINES["value"]
 
-    @property
-    def shares_starts(self) -> bool:
-        """Whether several environments start alike."""
-        return self.episodes_per_start > 1
-
     def _critic_rate(self) -> float:
         if self.critic_learning_rate is None:
             self._renew_lr_schedule()
@@ -377,7 +372,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
         """Reset the environments where the next rollout does not continue their episodes."""
-        if self.shares_starts:
+        if self.episodes_per_start > 1:
             self._last_obs = None
             self._last_obs = start_groups(env, self.episodes_per_start)
         # A measurement that failed in a callback leaves no observation

@@ -171,18 +171,19 @@ def check_reinforce(model: Any) -> None:
     """Check the arguments of a REINFORCE, and choose between steps and whole episodes where the user has not."""
     check_attributes(model)
     check_noise(model.use_sde, model.action_space)
+    shares_starts = model.episodes_per_start > 1
     if model.n_steps is None and model.n_episodes is None:
-        if model.has_critic and not (model.shares_starts or model.prefers_episodes):
+        if model.has_critic and not (shares_starts or model.prefers_episodes):
             model._choose("n_steps", 32)
         else:
             n_envs = model.n_envs * rank_and_size()[1]
-            model._choose("n_episodes", n_envs if model.shares_starts else max(16, n_envs))
+            model._choose("n_episodes", n_envs if shares_starts else max(16, n_envs))
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
     compares_episodes = model.baseline in ("time_mean", "leave_one_out", "optimal")
     # For episodes that share their start, check_starts says what is allowed
-    if model.n_episodes == 1 and compares_episodes and not model.shares_starts:
+    if model.n_episodes == 1 and compares_episodes and not shares_starts:
         reason = f"baseline={model.baseline!r}, which compares episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):

@@ -1,6 +1,7 @@
 """Spaces: which ones are supported, and how actions are stored, evaluated and sent to environments."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -68,9 +69,7 @@ def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarr
     space = policy.action_space
     if isinstance(space, spaces.Box):
         return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(space.low, space.high)
-    if np.any(getattr(space, "start", 0)):
-        return lambda actions: shift_to_start(space, actions)
-    return lambda actions: actions
+    return partial(shift_to_start, space)
 
 
 def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
