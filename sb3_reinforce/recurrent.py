@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.tensors import concatenate, flatten, select, shaped_like, take
 from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.critic import next_values_of
-from sb3_reinforce.policies.evaluation import Route
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
 from sb3_reinforce.reinforce import REINFORCE
@@ -85,6 +84,8 @@ class RecurrentREINFORCE(REINFORCE):
         batch_size: int = 4096,
         **kwargs: Any,
     ):
+        # This rollout starts from _state, the next one from _next_state: shape (n_envs, 2 for actor and critic, 2,
+        # n_layers, n_hidden), or None where all are zero. _actor is set only while a rollout is collected
         self._actor: RecurrentActor | None = None
         self._next_state: th.Tensor | None = None
         self._are_whole = True
@@ -152,7 +153,7 @@ class RecurrentREINFORCE(REINFORCE):
         super()._start_episodes(env, are_whole)
         self._are_whole = are_whole
 
-    def _make_actor(self, route: Route, with_log_prob: bool) -> RecurrentActor:
+    def _make_actor(self, calls_forward: bool, with_log_prob: bool) -> RecurrentActor:
         policy = self.policy
         check_sequence_methods(type(policy), vars(policy).keys())
         if self._actor is not None:
@@ -178,7 +179,9 @@ class RecurrentREINFORCE(REINFORCE):
         return state
 
     @th.no_grad()
-    def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(
+        self, has_values: bool, buffer: RolloutBuffer, columns: Columns
+    ) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
         policy = self.policy
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state

@@ -37,12 +37,10 @@ from sb3_reinforce.estimation.weights import Batch, complete_rollout, training_b
 from sb3_reinforce.policies.critic import fit_critic, rollout_values
 from sb3_reinforce.policies.evaluation import (
     Parameters,
-    Route,
     acting_log_prob,
     actor_parameters,
     evaluate,
     floor_std,
-    route_of,
     sampled_divergence,
     set_temperature,
     some_steps,
@@ -51,6 +49,7 @@ from sb3_reinforce.policies.evaluation import (
 from sb3_reinforce.policies.groups import ParameterGroups
 from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
+from sb3_reinforce.policies.plain_mlp import plain_actor
 from sb3_reinforce.sampling.actors import Actor, make_actor
 from sb3_reinforce.sampling.collection import Extent, check_rollout_data, collect, keep_fractions, warn_of_own_methods
 from sb3_reinforce.sampling.columns import Columns, gather
@@ -333,21 +332,22 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
         baseline = check_function("baseline", self.baseline, BASELINES)
-        route = route_of(self.policy, with_critic=self.has_critic)
         self.rollout = None
         is_collected = False
         self.is_collecting = True
         try:
-            collected = collect(self, env, callback, rollout_buffer, extent, route, self._make_actor)
+            collected = collect(self, env, callback, rollout_buffer, extent, self.has_critic, self._make_actor)
             if collected is None:
                 return False
             # Not named dones, which in a callback's locals are those of the last step, as with A2C
-            all_dones, terminal_obs, route = collected
+            all_dones, terminal_obs, has_values = collected
             check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
             own = Columns(all_dones, terminal_obs, self._last_obs, extent.quota, self._state)
             columns = gather(self, rollout_buffer, own)
             if columns is not None:
-                self.rollout = self._complete(rollout_buffer, columns, route, baseline, n_rollout_steps is not None)
+                self.rollout = self._complete(
+                    rollout_buffer, columns, has_values, baseline, n_rollout_steps is not None
+                )
                 self._running = self._running.after(rollout_buffer.rewards, columns.dones, self.gamma)
             is_collected = True
         except Exception:
@@ -383,13 +383,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
     def _complete(
-        self, buffer: RolloutBuffer, columns: Columns, route: Route, baseline: Baseline, is_fixed: bool
+        self, buffer: RolloutBuffer, columns: Columns, has_values: bool, baseline: Baseline, is_fixed: bool
     ) -> Rollout:
         """The rollout with the weights of its steps, which the buffer gets too."""
         self._running = self._running.restarted(where=buffer.episode_starts[0].astype(bool))
         next_values = None
-        if route.with_critic:
-            buffer.values, next_values = self._evaluate_critic(route, buffer, columns)
+        if baseline is BASELINES["value"]:
+            buffer.values, next_values = self._evaluate_critic(has_values, buffer, columns)
         rollout, buffer.advantages, buffer.returns = complete_rollout(
             buffer,
             self.policy,
@@ -411,12 +411,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def collect_part(self, callback: BaseCallback) -> None:
         self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
 
-    def _make_actor(self, route: Route, with_log_prob: bool) -> Actor:
-        return make_actor(self.policy, route, self.n_envs, with_log_prob)
+    def _make_actor(self, calls_forward: bool, with_log_prob: bool) -> Actor:
+        return make_actor(self.policy, calls_forward, self.n_envs, with_log_prob)
 
-    def _evaluate_critic(self, route: Route, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(
+        self, has_values: bool, buffer: RolloutBuffer, columns: Columns
+    ) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""
-        return rollout_values(self.policy, route, buffer, columns.dones, columns.last_obs, columns.terminal_obs)
+        return rollout_values(self.policy, has_values, buffer, columns.dones, columns.last_obs, columns.terminal_obs)
 
     @uninterrupted
     def train(self) -> None:
@@ -432,16 +434,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ent_coef = self._scheduled("ent_coef")
         critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)
-        route = route_of(self.policy, with_critic=rollout.values is not None)
         actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
 
         # The natural step bounds the policy's change, and the critic's error has no part in that
         with_values = bool(shared) and self.step == "optimizer"
-        log_prob, entropy, values = evaluate(
-            self.policy, route, batch.observations, batch.actions, with_values=with_values
-        )
+        log_prob, entropy, values = evaluate(self.policy, batch.observations, batch.actions, with_values)
         # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
         # (Williams, 1992, equation 4)
         policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
@@ -455,7 +454,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             gradients = th.autograd.grad(loss, actor, allow_unused=True)
             # Divergences are those of the policy that acts: dropout and batch normalization in evaluation mode
             self.policy.set_training_mode(False)
-            grad_norm, kl = self._step_policy(route, batch, actor, gradients, log_prob.detach())
+            grad_norm, kl = self._step_policy(batch, actor, gradients, log_prob.detach())
             self.policy.set_training_mode(True)
         # load applies the temperature of this progress, and a model that is saved now must act like it
         self._apply_temperature_and_floor()
@@ -470,13 +469,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         if batch.values is not None:
             last_gradients = [parameter.grad for parameter in actor]
-            self._train_critic(route, batch, batch.values, critic, bool(shared), critic_rate)
+            self._train_critic(batch, batch.values, critic, bool(shared), critic_rate)
             # The critic's passes clear them, and a callback may log them
             for parameter, gradient in zip(actor, last_gradients, strict=True):
                 parameter.grad = gradient
 
     def _step_policy(
-        self, route: Route, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor
+        self, batch: Batch, actor: Parameters, gradients: Sequence[th.Tensor | None], log_prob: th.Tensor
     ) -> tuple[float, float]:
         """Step against the gradients; return their norm and the divergence. ``log_prob`` is log π before the step."""
         obs, actions = batch.observations, batch.actions
@@ -484,17 +483,15 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
             check_distribution(self.policy, obs, actions, log_prob)
             return natural_step(self.policy, obs, actor, gradients, target_kl)
-        if route.actor is None:
+        if plain_actor(self.policy) is None:
             # Passes over images take long, and log π in training mode may differ, as with dropout
             obs, actions = some_steps(self.policy, obs, actions)
-            log_prob = acting_log_prob(self.policy, route, obs, actions)
+            log_prob = acting_log_prob(self.policy, obs, actions)
         with optimization.kept_finite(self.policy.optimizer, actor, "policy"):
             grad_norm = optimization.step(self.policy.optimizer, actor, gradients, self.max_grad_norm, "policy")
-        return grad_norm, sampled_divergence(self.policy, route, obs, actions, log_prob)
+        return grad_norm, sampled_divergence(self.policy, obs, actions, log_prob)
 
-    def _train_critic(
-        self, route: Route, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float
-    ) -> None:
+    def _train_critic(self, batch: Batch, values: th.Tensor, critic: Parameters, is_shared: bool, rate: float) -> None:
         """The critic's passes over the rollout; ``values`` are V(s_t) before them."""
         if is_shared:
             # Passes in training mode would move shared batch statistics, a second step of the policy
@@ -506,7 +503,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if critic:
             value_loss = fit_critic(
                 self.policy,
-                route,
                 self.critic_optimizer,
                 critic,
                 batch.observations,

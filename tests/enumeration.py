@@ -19,7 +19,6 @@ from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.estimation.rollout import Running
 from sb3_reinforce.estimation.weights import complete_rollout
 from sb3_reinforce.policies.critic import rollout_values
-from sb3_reinforce.policies.evaluation import route_of
 
 GAMMA = 0.5
 ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normalize_by", "episodes_per_start")
@@ -91,9 +90,8 @@ def rollout_of(model, batch):
     buffer, dones = fill(model, batch)
     next_values = None
     if model.has_critic:
-        route = route_of(model.policy, with_critic=True)
         last_obs = buffer.observations[-1]
-        buffer.values, next_values = rollout_values(model.policy, route, buffer, dones, last_obs, {})
+        buffer.values, next_values = rollout_values(model.policy, False, buffer, dones, last_obs, {})
     rollout, *_ = complete(model, buffer, dones, next_values)
     return rollout, BASELINES.get(str(model.baseline), model.baseline)(rollout)
 

@@ -14,7 +14,7 @@ from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
-from sb3_reinforce.policies.evaluation import Parameters, evaluate, log_prob_of, route_of, trainable
+from sb3_reinforce.policies.evaluation import Parameters, evaluate, log_prob_of, trainable
 from sb3_reinforce.policies.parameters import write
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
@@ -190,7 +190,7 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
         pair = []
         for _ in range(2):
             actions = draw(policy, one, n_draws)
-            log_prob, entropy, _ = evaluate(policy, route_of(policy), many, actions, with_values=False)
+            log_prob, entropy, _ = evaluate(policy, many, actions)
             # Below 0.1 nats a sample may lack the rare actions, with which the variance of log π is at least H
             h = 0.0 if isinstance(policy.action_space, spaces.Box) else float(entropy.mean())
             least = math.sqrt(h) if 0 < h < 0.1 else 0.0

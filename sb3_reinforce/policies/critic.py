@@ -14,8 +14,8 @@ from torch.nn import functional as F
 
 from sb3_reinforce.common import optimization
 from sb3_reinforce.common.tensors import flatten, stack, take
-from sb3_reinforce.policies.evaluation import Parameters, Route, extract_features, must_call
-from sb3_reinforce.policies.plain_mlp import evaluate_layers, is_plain_extractor, overrides
+from sb3_reinforce.policies.evaluation import Parameters, extract_features, must_call
+from sb3_reinforce.policies.plain_mlp import is_plain_extractor, overrides
 from sb3_reinforce.policies.sequences import RecurrentPolicy, sequence_minibatches
 
 Value: TypeAlias = Callable[[Any], th.Tensor]
@@ -24,22 +24,21 @@ Value: TypeAlias = Callable[[Any], th.Tensor]
 @th.no_grad()
 def rollout_values(
     policy: ActorCriticPolicy,
-    route: Route,
+    has_values: bool,
     buffer: RolloutBuffer,
     dones: NDArray[np.bool_],
     last_obs: Any,
     terminal_obs: dict[tuple[int, int], Any],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """V(s_t), in one batch unless it came along with the actions, and V(s_{t+1}): float32 ``(n_steps, n_envs)``."""
-    value = value_function(policy, route)
+    """V(s_t), in one batch unless the buffer has it already, and V(s_{t+1}): float32 ``(n_steps, n_envs)``."""
 
     def predict(obs: Any) -> np.ndarray:
-        return value(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
+        return policy.predict_values(obs_as_tensor(obs, policy.device)).flatten().cpu().numpy()
 
     values = buffer.values
-    if not route.forward:
+    if not has_values:
         obs = flatten(obs_as_tensor(buffer.observations, policy.device))
-        values = value(obs).reshape(dones.shape).cpu().numpy()
+        values = policy.predict_values(obs).reshape(dones.shape).cpu().numpy()
     last_values = predict(last_obs)
     terminal_values = predict(stack(list(terminal_obs.values()))) if terminal_obs else ()
     return values, next_values_of(values, dones, last_values, terminal_obs, terminal_values)
@@ -59,18 +58,8 @@ def next_values_of(
     return next_values
 
 
-def value_function(policy: ActorCriticPolicy, route: Route) -> Value:
-    """V as a function of ``n`` observations, shape ``(n, 1)``."""
-    layers = route.critic
-    if layers is None:
-        return policy.predict_values
-    extractor = policy.vf_features_extractor
-    return lambda obs: evaluate_layers(layers, extract_features(policy, obs, extractor))
-
-
 def fit_critic(
     policy: ActorCriticPolicy,
-    route: Route,
     optimizer: th.optim.Optimizer,
     parameters: Parameters,
     obs: PyTorchObs,
@@ -87,7 +76,7 @@ def fit_critic(
     parameter that is not finite afterwards raises one too, and the critic keeps the parameters before all passes.
     """
     losses = []
-    value = value_of_batch(policy, route, parameters, obs, actions)
+    value = value_of_batch(policy, parameters, obs, actions)
     with optimization.kept_finite(optimizer, parameters, "critic"):
         for _ in range(n_updates):
             for batch in minibatches(policy, obs, len(returns), batch_size):
@@ -116,15 +105,12 @@ def minibatches(policy: ActorCriticPolicy, obs: Any, n: int, size: int) -> Itera
     return batches
 
 
-def value_of_batch(
-    policy: ActorCriticPolicy, route: Route, parameters: Parameters, obs: PyTorchObs, actions: th.Tensor
-) -> Value:
+def value_of_batch(policy: ActorCriticPolicy, parameters: Parameters, obs: PyTorchObs, actions: th.Tensor) -> Value:
     """
     V of the steps with given indices, as the critic's passes evaluate it.
 
     The features are computed once if the passes do not change the features extractor: they are the same in every pass.
     """
-    layers = route.critic
     extractor = policy.vf_features_extractor
     is_trained = not set(parameters).isdisjoint(extractor.parameters())
     # In training mode Dropout draws new masks for each pass, and BatchNorm looks at each minibatch
@@ -135,13 +121,11 @@ def value_of_batch(
             with th.no_grad():
                 rows = {**rows, "features": policy.row_features(rows, extractor)}
         return lambda batch: policy.sequence_values(take(rows, batch))
-    if layers is None and must_call(policy, "evaluate_actions"):
+    if must_call(policy, "evaluate_actions"):
         # V of such a policy may only be found along with log π
         return lambda batch: policy.evaluate_actions(take(obs, batch), actions[batch])[0]
     if overrides(policy, "predict_values") or not is_fixed:
         return lambda batch: policy.predict_values(take(obs, batch))
     with th.no_grad():
         features = extract_features(policy, obs, extractor)
-    if layers is not None:
-        return lambda batch: evaluate_layers(layers, features[batch])
     return lambda batch: policy.value_net(policy.mlp_extractor.forward_critic(features[batch]))

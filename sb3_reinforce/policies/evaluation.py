@@ -1,11 +1,10 @@
 """
 What is asked of an actor-critic policy: log π(a|s), the entropy, V(s), which parameters these depend on, and the
-temperature. A method that a user has overridden is called as it is; ``Route`` says which methods are called.
+temperature. A method that a user has overridden is called as it is; ``calls`` says which methods are called.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import torch as th
@@ -17,11 +16,8 @@ from torch import nn
 from sb3_reinforce.common.tensors import take
 from sb3_reinforce.policies.plain_mlp import (
     DivideLogits,
-    evaluate_layers,
     hooks_of,
     overrides,
-    plain_actor,
-    plain_critic,
     takes_vectors,
     temperature_hooks,
 )
@@ -35,45 +31,19 @@ MIN_STEPS = 64
 MIN_TEMPERATURE = 1e-3
 
 
-@dataclass(frozen=True)
-class Route:
+def calls(policy: ActorCriticPolicy, method: str, with_values: bool = False) -> bool:
     """
-    Which methods of a policy are called, in a rollout (until a callback changes the policy) or an update.
+    Whether a method, ``forward`` or ``evaluate_actions``, is called instead of ``get_distribution`` (and, with values,
+    ``predict_values``).
 
-    ``actor`` and ``critic`` are the layers of plain MLPs, else None. With ``forward``, actions come from ``forward``,
-    and V and log π along with them. With ``evaluate_actions``, log π and V come from that method, else from
-    ``get_distribution`` and ``predict_values``.
-    """
-
-    with_critic: bool
-    actor: list[nn.Module] | None = None
-    critic: list[nn.Module] | None = None
-    forward: bool = False
-    evaluate_actions: bool = False
-
-
-def route_of(policy: ActorCriticPolicy, with_critic: bool = False) -> Route:
-    """
-    The route through a policy.
-
-    ``forward`` and ``evaluate_actions`` compute the features that actor and critic share only once, but bypass a user's
-    ``get_distribution`` and ``predict_values``.
+    Both compute the features that actor and critic share only once, but bypass a user's ``get_distribution`` and
+    ``predict_values``.
     """
     if isinstance(policy, RecurrentPolicy):
-        return Route(with_critic)
-    actor = plain_actor(policy)
-    critic = plain_critic(policy) if with_critic else None
-    if actor is not None:
-        return Route(with_critic, actor, critic)
-    own_parts = overrides(policy, "predict_values", "get_distribution")
+        return False
     shares = policy.share_features_extractor and bool(list(policy.features_extractor.parameters()))
-    at_once = with_critic and shares and not own_parts
-    return Route(
-        with_critic,
-        critic=critic,
-        forward=at_once or must_call(policy, "forward"),
-        evaluate_actions=at_once or must_call(policy, "evaluate_actions"),
-    )
+    at_once = with_values and shares and not overrides(policy, "predict_values", "get_distribution")
+    return at_once or must_call(policy, method)
 
 
 def must_call(policy: ActorCriticPolicy, method: str) -> bool:
@@ -106,7 +76,7 @@ def action_distribution(policy: ActorCriticPolicy, obs: Any) -> Distribution:
 
 
 def evaluate(
-    policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, with_values: bool
+    policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, with_values: bool = False
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
     """
     log π(a|s), the entropy of π(·|s), and V(s) or None, each of shape ``(n,)``.
@@ -114,17 +84,13 @@ def evaluate(
     An entropy without closed form (squashed Gaussian) is estimated, its gradient by the likelihood ratio.
     """
     values: th.Tensor | None = None
-    if route.evaluate_actions:
+    if calls(policy, "evaluate_actions", with_values):
         values, log_prob, entropy = policy.evaluate_actions(obs, actions)
         if entropy is not None and entropy.dim() == 0:
             # A user's method may return the mean, which is all that A2C takes of it
             entropy = entropy.expand_as(log_prob)
     else:
-        if route.actor is None:
-            distribution = action_distribution(policy, obs)
-        else:
-            features = extract_features(policy, obs, policy.pi_features_extractor)
-            distribution = distribution_of(policy, evaluate_layers(route.actor, features))
+        distribution = action_distribution(policy, obs)
         log_prob = distribution.log_prob(actions)
         entropy = distribution.entropy()
         if with_values:
@@ -142,18 +108,18 @@ def evaluate(
 
 
 def log_prob_of(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-    """log π(a|s), shape ``(n,)``; the critic is evaluated only if the route calls ``evaluate_actions``."""
-    return evaluate(policy, route_of(policy), obs, actions, with_values=False)[0]
+    """log π(a|s), shape ``(n,)``; the critic is evaluated only where ``evaluate_actions`` is called."""
+    return evaluate(policy, obs, actions)[0]
 
 
-def sampled_divergence(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
+def sampled_divergence(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, old: th.Tensor) -> float:
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
 
     Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative. NaN if π's outputs are.
     """
     try:
-        log_ratio = acting_log_prob(policy, route, obs, actions) - old
+        log_ratio = acting_log_prob(policy, obs, actions) - old
     except ValueError:
         # PyTorch makes no distribution of outputs that are not finite; the next rollout reports them
         return math.nan
@@ -170,16 +136,16 @@ def some_steps(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> tuple
     return take(obs, steps), actions[steps]
 
 
-def acting_log_prob(policy: ActorCriticPolicy, route: Route, obs: Any, actions: th.Tensor) -> th.Tensor:
+def acting_log_prob(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> th.Tensor:
     """log π(a|s) of the policy that acts, which is in evaluation mode."""
     # A user's evaluate_actions may differentiate
-    with th.set_grad_enabled(route.evaluate_actions and overrides(policy, "evaluate_actions")):
-        return evaluate(policy, route, obs, actions, with_values=False)[0].detach()
+    with th.set_grad_enabled(calls(policy, "evaluate_actions") and overrides(policy, "evaluate_actions")):
+        return log_prob_of(policy, obs, actions).detach()
 
 
 def leave_no_graph(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor) -> None:
     """Evaluate a policy without a graph: it keeps its last distribution, which could not be deep-copied with one."""
-    acting_log_prob(policy, route_of(policy), obs, actions)
+    acting_log_prob(policy, obs, actions)
 
 
 def trainable(policy: ActorCriticPolicy) -> Parameters:
@@ -195,8 +161,7 @@ def actor_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
 def critic_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> Parameters:
     """The trainable parameters that V depends on, in the policy's order."""
-    route = route_of(policy, with_critic=True)
-    return reached_by(lambda: cast(th.Tensor, evaluate(policy, route, obs, actions, True)[2]), trainable(policy))
+    return reached_by(lambda: cast(th.Tensor, evaluate(policy, obs, actions, True)[2]), trainable(policy))
 
 
 def reached_by(compute: Callable[[], th.Tensor], parameters: Parameters) -> Parameters:

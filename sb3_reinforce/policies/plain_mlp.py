@@ -24,7 +24,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
 from torch import nn
-from torch.nn import functional as F
 
 Float32s: TypeAlias = NDArray[np.float32]
 
@@ -104,26 +103,14 @@ def plain_actor(policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = Actor
     distribution = getattr(policy, "action_dist", None)
     if type(distribution) not in DISTRIBUTIONS or not is_unchanged(distribution):
         return None
-    return plain_layers(policy, base, "pi_features_extractor", "policy_net", "action_net")
-
-
-def plain_critic(policy: ActorCriticPolicy) -> list[nn.Module] | None:
-    """The layers from the features to V of a policy whose critic is known to be plain, else None."""
-    return plain_layers(policy, ActorCriticPolicy, "vf_features_extractor", "value_net", "value_net")
-
-
-def plain_layers(
-    policy: ActorCriticPolicy, base: type[ActorCriticPolicy], extractor: str, net: str, head: str
-) -> list[nn.Module] | None:
-    """The layers after the features extractor, or None if anything on the way is not known to be plain."""
     # A user's policy may lack any of these parts
     mlp = getattr(policy, "mlp_extractor", None)
     if own_methods(type(policy), base) - CONSTRUCTION or type(mlp) is not MlpExtractor:
         return None
-    body = getattr(mlp, net)
-    if type(body) is not nn.Sequential or not is_plain_extractor(getattr(policy, extractor, None)):
+    body = mlp.policy_net
+    if type(body) is not nn.Sequential or not is_plain_extractor(getattr(policy, "pi_features_extractor", None)):
         return None
-    layers = [*body, getattr(policy, head, None)]
+    layers = [*body, getattr(policy, "action_net", None)]
     is_plain = all(map(is_plain_layer, layers)) and all(map(is_unchanged, (policy, mlp, body, *layers)))
     return layers if is_plain else None
 
@@ -148,18 +135,6 @@ def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
     space = policy.observation_space
     is_flat = isinstance(space, spaces.Box) and not is_image_space(space) and type(extractor) is FlattenExtractor
     return is_flat and is_plain_extractor(extractor)
-
-
-def evaluate_layers(layers: list[nn.Module], x: th.Tensor) -> th.Tensor:
-    """The output of plain layers for inputs of shape ``(n, n_in)``; functions take half the time of small modules."""
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            x = F.linear(x, layer.weight, layer.bias)
-        elif isinstance(layer, nn.Tanh):
-            x = th.tanh(x)
-        else:
-            x = layer(x)
-    return apply_temperature(layers[-1], x)
 
 
 def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:

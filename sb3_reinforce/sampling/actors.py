@@ -21,8 +21,8 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
-from sb3_reinforce.policies.evaluation import Route, must_call
-from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, takes_vectors
+from sb3_reinforce.policies.evaluation import must_call
+from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, plain_actor, takes_vectors
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
@@ -31,9 +31,9 @@ Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 class PolicyActor:
     """Acts by the policy's own methods."""
 
-    def __init__(self, policy: ActorCriticPolicy, route: Route, with_log_prob: bool):
+    def __init__(self, policy: ActorCriticPolicy, calls_forward: bool, with_log_prob: bool):
         self.policy = policy
-        self.route = route
+        self.calls_forward = calls_forward
         self.with_log_prob = with_log_prob
         self.shape = policy.action_space.shape or ()
 
@@ -41,7 +41,7 @@ class PolicyActor:
     def act(self, obs: Any) -> Acted:
         """Draw actions for observations of ``n_envs`` environments."""
         obs = obs_as_tensor(obs, self.policy.device)
-        if not self.route.forward:
+        if not self.calls_forward:
             distribution = self.distribution(obs)
             actions = distribution.get_actions()
             log_prob = distribution.log_prob(actions).cpu().numpy() if self.with_log_prob else None
@@ -55,7 +55,7 @@ class PolicyActor:
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy would still act as this actor does."""
-        return policy is self.policy and (self.route.forward or not must_call(policy, "forward"))
+        return policy is self.policy and (self.calls_forward or not must_call(policy, "forward"))
 
 
 class NumpyActor:
@@ -71,6 +71,7 @@ class NumpyActor:
         self.sample = sampler_of(policy, n_envs)
         self.outputs: list[Float32s] = []
         self.log_stds: list[Float32s] = []
+        # The rest is what is_current compares
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
         self.distribution = policy.action_dist
@@ -125,11 +126,12 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
     return [tensor.data_ptr() for tensor in tensors]
 
 
-def make_actor(policy: ActorCriticPolicy, route: Route, n_envs: int, with_log_prob: bool) -> Actor:
+def make_actor(policy: ActorCriticPolicy, calls_forward: bool, n_envs: int, with_log_prob: bool) -> Actor:
     """The fastest actor that acts as the policy would; it may leave out log π without ``with_log_prob``."""
-    if route.actor and has_numpy_form(route.actor) and takes_vectors(policy, policy.pi_features_extractor):
-        return NumpyActor(policy, route.actor, n_envs, with_log_prob)
-    return PolicyActor(policy, route, with_log_prob)
+    layers = plain_actor(policy)
+    if layers and has_numpy_form(layers) and takes_vectors(policy, policy.pi_features_extractor):
+        return NumpyActor(policy, layers, n_envs, with_log_prob)
+    return PolicyActor(policy, calls_forward, with_log_prob)
 
 
 def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Float32s], np.ndarray]:

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,7 +17,7 @@ from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.common.tensors import map_parts
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.returns import Bools
-from sb3_reinforce.policies.evaluation import Route, route_of
+from sb3_reinforce.policies.evaluation import calls
 from sb3_reinforce.sampling.actors import Actor, NumpyActor
 
 # The terminal observation at each (step, environment) where a time limit ended an episode that counts
@@ -81,22 +80,23 @@ def collect(
     callback: BaseCallback,
     rollout_buffer: RolloutBuffer,
     extent: Extent,
-    route: Route,
-    actor_of: Callable[[Route, bool], Actor],
-) -> tuple[Bools, TerminalObs, Route] | None:
+    with_critic: bool,
+    actor_of: Callable[[bool, bool], Actor],
+) -> tuple[Bools, TerminalObs, bool] | None:
     """
     Step the environments and write what happens into a rollout buffer, which ends with one row per step.
 
-    Returns ``dones`` of shape ``(n_steps, n_envs)``, the terminal observations at time limits and the route to the
-    values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them, or
-    ``forward`` returns them with the actions: training has no use for them.
+    Returns ``dones`` of shape ``(n_steps, n_envs)``, the terminal observations at time limits and whether the buffer
+    has the values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read
+    them, or ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
     # A user may have set numbers
     model._last_episode_starts = np.asarray(model._last_episode_starts, dtype=bool)
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
-    actor = actor_of(route, is_attached)
+    has_values = calls(policy, "forward", with_critic)
+    actor = actor_of(has_values, is_attached)
     as_env_actions = env_actions_of(policy)
     starts = [model._last_episode_starts.copy()]
     terminal_obs: TerminalObs = {}
@@ -140,17 +140,16 @@ def collect(
         if is_attached and not actor.is_current(model.policy):
             write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
-            route = route_of(policy, route.with_critic)
-            actor = actor_of(route, is_attached)
+            actor = actor_of(calls(policy, "forward", with_critic), is_attached)
             # The values of the rows so far came from another policy: they are computed in one batch instead
-            route = replace(route, forward=False)
+            has_values = False
             first_row = n_steps
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
     rollout_buffer.episode_starts[:] = starts[:-1]
     if is_attached:
         write_log_probs(rollout_buffer, actor, first_row)
-    return np.array(starts[1:]), terminal_obs, route
+    return np.array(starts[1:]), terminal_obs, has_values
 
 
 def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:

@@ -9,7 +9,6 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_reinforce.estimation.returns import Bools
-from sb3_reinforce.policies.evaluation import route_of
 from sb3_reinforce.policies.plain_mlp import has_numpy_form, is_unchanged, linear_operation, plain_actor, takes_vectors
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
@@ -22,7 +21,7 @@ class RecurrentPolicyActor(PolicyActor):
     """Acts by the policy's own methods, from a state of shape ``(n_envs, 2, n_layers, n_hidden)``."""
 
     def __init__(self, policy: RecurrentPolicy, state: th.Tensor, starts: Starts, with_log_prob: bool):
-        super().__init__(policy, route_of(policy), with_log_prob)
+        super().__init__(policy, False, with_log_prob)
         self.starts = starts
         self.halves = tuple(state.permute(1, 2, 0, 3).contiguous())
 

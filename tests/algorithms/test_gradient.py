@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.estimation.weights import standardize
-from sb3_reinforce.policies.evaluation import evaluate, route_of
+from sb3_reinforce.policies.evaluation import evaluate
 
 GAMMA = 0.5
 N_OBS = 5
@@ -325,7 +325,7 @@ def test_the_entropy_bonus_raises_the_entropy_of_a_squashed_gaussian():
 
         policy.reset_noise(200_000)
         actions = policy.get_distribution(obs).get_actions()
-    _, found, _ = evaluate(policy, route_of(policy), obs, actions, with_values=False)
+    _, found, _ = evaluate(policy, obs, actions, with_values=False)
     (gradient,) = th.autograd.grad(found.mean(), [policy.log_std])
     expected = (entropy(0.01) - entropy(-0.01)) / 0.02
     assert abs(expected) > 0.1

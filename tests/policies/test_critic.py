@@ -14,8 +14,7 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.evaluation import evaluate, route_of
-from sb3_reinforce.policies.plain_mlp import plain_critic
+from sb3_reinforce.policies.evaluation import evaluate
 
 N_STEPS, N_ENVS = 7, 3
 IMAGES = partial(Random, spaces.Box(0, 255, (36, 36, 3), np.uint8), lengths=(10,))
@@ -115,7 +114,6 @@ def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs,
         expected = model.policy.predict_values(observations(buffer)).reshape(N_STEPS, N_ENVS)
     np.testing.assert_allclose(buffer.values, expected, rtol=1e-4, atol=1e-6)
     assert change == "method" or np.std(buffer.values) > 1e-3
-    assert (plain_critic(model.policy) is not None) == (change in ("none", "tied") and policy is ActorCriticPolicy)
 
 
 @pytest.mark.parametrize(
@@ -177,9 +175,7 @@ def test_values_of_the_policy_step_are_those_of_predict_values(policy):
     own = type("Own", (policy,), {"predict_values": lambda self, obs: th.full((len(obs), 1), 3.0)})
     model = make(own).learn(1)
     obs = observations(model.rollout_buffer)
-    assert (
-        evaluate(model.policy, route_of(model.policy, True), obs, th.zeros(len(obs)), with_values=True)[2] == 3
-    ).all()
+    assert (evaluate(model.policy, obs, th.zeros(len(obs)), with_values=True)[2] == 3).all()
 
 
 @pytest.mark.parametrize("extractor", [FlattenExtractor, Scaled])

@@ -16,13 +16,12 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import GradientQualityCallback, PitfallCallback
 from sb3_reinforce.estimation.weights import training_batch
-from sb3_reinforce.policies.evaluation import log_prob_of, route_of, sampled_divergence, some_steps
+from sb3_reinforce.policies.evaluation import log_prob_of, sampled_divergence, some_steps
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 
 def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
     policy, obs = make_model().policy, th.eye(3)[[0, 0, 0, 1, 2, 2]]
-    route = route_of(policy)
     with th.no_grad():
         old = policy.get_distribution(obs).distribution.logits.clone()
         policy.action_net.weight.copy_(th.tensor([[1.0, -0.3, 0.2], [0.5, 0.1, -0.4]]))
@@ -32,7 +31,7 @@ def test_the_sampled_divergence_has_the_expectation_of_the_divergence():
     found = 0.0
     for i in range(len(obs)):
         for action in range(2):
-            k3 = sampled_divergence(policy, route, obs[i : i + 1], th.tensor([action]), old[i, action])
+            k3 = sampled_divergence(policy, obs[i : i + 1], th.tensor([action]), old[i, action])
             found += float(old[i, action].exp()) * k3 / len(obs)
     assert found == pytest.approx(float(expected), rel=1e-10)
 
@@ -109,7 +108,7 @@ def test_the_divergence_of_a_recurrent_policy_is_evaluated_without_gradients(pol
     original, modes = model.policy.sequence_distribution, []
     model.policy.sequence_distribution = lambda rows: modes.append(th.is_grad_enabled()) or original(rows)
     batch = training_batch(model.rollout, model.rollout_buffer, False)
-    sampled_divergence(model.policy, route_of(model.policy), batch.observations, batch.actions, th.zeros(()))
+    sampled_divergence(model.policy, batch.observations, batch.actions, th.zeros(()))
     assert modes == [False]
 
 
@@ -118,4 +117,4 @@ def test_the_divergence_of_outputs_that_are_not_finite_is_nan():
     policy = REINFORCE("MlpPolicy", Corridor(), device="cpu").policy
     with th.no_grad():
         policy.action_net.bias.fill_(math.nan)
-    assert math.isnan(sampled_divergence(policy, route_of(policy), th.ones(2, 3), th.zeros(2), th.zeros(2)))
+    assert math.isnan(sampled_divergence(policy, th.ones(2, 3), th.zeros(2), th.zeros(2)))

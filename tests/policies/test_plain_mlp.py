@@ -10,8 +10,8 @@ from torch import nn
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.policies import plain_mlp
-from sb3_reinforce.policies.evaluation import route_of
-from sb3_reinforce.policies.plain_mlp import DivideLogits, evaluate_layers, has_numpy_form, numpy_forward
+from sb3_reinforce.policies.evaluation import calls
+from sb3_reinforce.policies.plain_mlp import DivideLogits, has_numpy_form, numpy_forward
 
 MLPS = {
     "tanh": [nn.Linear(3, 5), nn.Tanh(), nn.Linear(5, 4), nn.Tanh(), nn.Linear(4, 2)],
@@ -70,17 +70,6 @@ def test_other_layers_and_precisions_have_no_numpy_form():
     assert not has_numpy_form([nn.Tanh(), nn.Linear(3, 2)])
 
 
-def test_value_and_gradient_are_the_modules(layers):
-    parameters = list(nn.Sequential(*layers).parameters())
-    x = th.randn(7, 3)
-    output = evaluate_layers(layers, x)
-    expected = nn.Sequential(*layers)(x)
-    th.testing.assert_close(output, expected)
-    weights = th.randn(expected.shape)
-    gradients, expected_gradients = (th.autograd.grad((weights * y).sum(), parameters) for y in (output, expected))
-    th.testing.assert_close(gradients, expected_gradients)
-
-
 def test_numpy_never_warns_as_pytorch_does_not():
     layer = nn.Linear(3, 2)
     nn.init.constant_(layer.weight, th.finfo(th.float32).max)
@@ -89,5 +78,5 @@ def test_numpy_never_warns_as_pytorch_does_not():
 
 def test_a_compiled_policy_is_called_itself():
     """Its methods would bypass what was compiled."""
-    route = route_of(th.compile(REINFORCE("MlpPolicy", "CartPole-v1", device="cpu").policy, backend="eager"), True)
-    assert route.forward and route.evaluate_actions
+    policy = th.compile(REINFORCE("MlpPolicy", "CartPole-v1", device="cpu").policy, backend="eager")
+    assert calls(policy, "forward") and calls(policy, "evaluate_actions")

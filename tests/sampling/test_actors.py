@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.policies.evaluation import route_of
+from sb3_reinforce.policies.evaluation import calls
 from sb3_reinforce.policies.plain_mlp import plain_actor
 from sb3_reinforce.sampling.actors import NumpyActor, PolicyActor, make_actor
 
@@ -36,7 +36,7 @@ def make_policy(space=SPACES[0], policy="MlpPolicy", **kwargs):
 
 
 def actor_of(policy, n_envs):
-    return make_actor(policy, route_of(policy), n_envs, with_log_prob=True)
+    return make_actor(policy, calls(policy, "forward"), n_envs, with_log_prob=True)
 
 
 @pytest.mark.parametrize(("space", "kwargs"), [*((space, {}) for space in SPACES), (SPACES[0], {"temperature": 0.3})])
@@ -48,7 +48,7 @@ def test_the_same_seed_gives_the_same_actions(space, kwargs, activation_fn, n_en
     obs = np.random.default_rng(0).normal(size=(20, n_envs, 5)).astype(np.float32)
     actions = []
     fast = actor_of(policy, n_envs)
-    general = PolicyActor(policy, route_of(policy), with_log_prob=True)
+    general = PolicyActor(policy, calls(policy, "forward"), with_log_prob=True)
     assert isinstance(fast, NumpyActor)
     for actor in (fast, general):
         th.manual_seed(1)

@@ -225,11 +225,12 @@ def test_one_actor_pass_a_step_and_values_once_per_rollout(baseline, activation_
         method = partial(getattr(ActorCriticPolicy, name), model.policy)
         counted = lambda *args, name=name, method=method: calls.append(name) or method(*args)  # noqa: E731
         monkeypatch.setattr(ActorCriticPolicy, name, staticmethod(counted))
+    monkeypatch.setattr(model, "train", lambda: None)
     model.learn(1, callback)
     assert calls.count("get_distribution") == (0 if activation_fn is th.nn.Tanh else model.rollout_buffer.size())
     assert model.rollout_buffer.log_probs.any() == (callback is not None)
-    # It is asked once, for the parameters that V depends on
-    assert calls.count("predict_values") == (baseline == "value")
+    # For all steps, and for the observations after the last one
+    assert calls.count("predict_values") == 2 * (baseline == "value")
 
 
 class OwnForward(ActorCriticPolicy):
