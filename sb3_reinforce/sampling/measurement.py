@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
@@ -35,6 +36,9 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
         finally:
             give_new_seeds(env)
         obs = env.reset()
+    if model.use_sde:
+        # A2C and PPO draw theirs before on_rollout_start, where they may be measured
+        cast(ActorCriticPolicy, model.policy).reset_noise(env.num_envs)
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     model._last_obs = obs  # type: ignore[assignment]
 

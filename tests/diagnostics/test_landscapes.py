@@ -8,9 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 import torch as th
+from callbacks import Record
 from enumeration import make_model, true_gradient
 from environments import Corridor, Scales, Tree
 from gymnasium import spaces
+from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -321,6 +323,19 @@ def test_the_utility_of_a_policy_with_gsde_has_new_noise_in_each_step():
         model.policy.reset_noise(8)
         utility = CandidateUtility(model, 2000, seed=0)
         assert abs(float(utility(utility.theta[None]))) < 4.5 / 2000**0.5
+
+
+def test_a_measurement_before_a_rollout_leaves_each_environment_its_noise():
+    """A2C draws the noise of gSDE before ``on_rollout_start``."""
+    env = make_vec_env(lambda: Corridor((3,), action_space=spaces.Box(-1, 1, (1,))), 4)
+    model = A2C("MlpPolicy", env, use_sde=True, n_steps=2, seed=0, device="cpu")
+
+    def measured(model):
+        landscape(model, n_points=2, n_episodes=1)
+        return len(model.policy.action_dist.exploration_matrices)
+
+    model.learn(8, measurement := Record(measured, at="rollout_start"))
+    assert measurement.records == [4]
 
 
 def test_the_likelihood_ratio_is_of_rewards_that_are_not_clipped():
