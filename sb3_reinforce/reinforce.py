@@ -39,6 +39,7 @@ from sb3_reinforce.policies.evaluation import (
     Parameters,
     acting_log_prob,
     actor_parameters,
+    calls,
     evaluate,
     floor_std,
     sampled_divergence,
@@ -439,13 +440,15 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self._update_learning_rate(self.policy.optimizer)
 
         # The natural step bounds the policy's change, and the critic's error has no part in that
-        with_values = bool(shared) and self.step == "optimizer"
+        trains_values = bool(shared) and self.step == "optimizer"
+        # log π is learned by the method that acted, which may compute V too
+        with_values = trains_values or (batch.values is not None and calls(self.policy, "evaluate_actions", True))
         log_prob, entropy, values = evaluate(self.policy, batch.observations, batch.actions, with_values)
         # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
         # (Williams, 1992, equation 4)
         policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
         loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
-        if with_values and values is not None:
+        if trains_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
             loss = loss + self.vf_coef * F.mse_loss(values, batch.returns.to(values))
         grad_norm = kl = 0.0

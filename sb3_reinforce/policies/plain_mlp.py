@@ -1,5 +1,5 @@
 """
-Plain MLPs: which actors and critics are known to be one, and their forward pass without the overhead of modules.
+Plain MLPs: which actors are known to be one, and their forward pass without the overhead of modules.
 
 A network is plain only if everything on the way from the observation to its output is an unchanged object of
 Stable-Baselines3 or PyTorch. A hook, a replaced method or a class of the user makes it general, and then the policy

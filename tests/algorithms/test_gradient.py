@@ -325,7 +325,7 @@ def test_the_entropy_bonus_raises_the_entropy_of_a_squashed_gaussian():
 
         policy.reset_noise(200_000)
         actions = policy.get_distribution(obs).get_actions()
-    _, found, _ = evaluate(policy, obs, actions, with_values=False)
+    _, found, _ = evaluate(policy, obs, actions)
     (gradient,) = th.autograd.grad(found.mean(), [policy.log_std])
     expected = (entropy(0.01) - entropy(-0.01)) / 0.02
     assert abs(expected) > 0.1

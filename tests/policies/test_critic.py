@@ -11,9 +11,10 @@ from gymnasium import spaces
 from models import Dropping, Scaled, moved_by_learning
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 
 from sb3_reinforce import REINFORCE
+from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies.evaluation import evaluate
 
 N_STEPS, N_ENVS = 7, 3
@@ -80,19 +81,14 @@ def test_a_policys_own_distribution_is_used_with_a_shared_features_extractor(mod
     np.testing.assert_allclose(model.rollout_buffer.log_probs, 0, atol=1e-6)
 
 
-def tie(policy):
-    net = policy.mlp_extractor.value_net
-    net.extend([th.nn.Linear(64, 64), th.nn.Linear(64, 64)])
-    net[-1].bias = net[-2].bias
-
-
 CHANGES = {
     "none": lambda policy: None,
     "method": lambda policy: setattr(policy, "predict_values", lambda obs: th.full((len(obs), 1), 3.0)),
     "class": lambda policy: setattr(policy, "__class__", overriding(type(policy))),
     "hook": lambda policy: policy.mlp_extractor.value_net.register_forward_hook(lambda module, x, output: output + 1),
-    "no bias": lambda policy: setattr(policy.value_net, "bias", None),
-    "tied": tie,
+    "parameter of the extractor": lambda policy: setattr(
+        policy.features_extractor, "scale", th.nn.Parameter(th.ones(1))
+    ),
 }
 
 
@@ -100,13 +96,12 @@ CHANGES = {
     ("policy", "kwargs", "change"),
     [
         *((ActorCriticPolicy, {}, change) for change in CHANGES),
-        (ActorCriticPolicy, {"activation_fn": th.nn.ReLU}, "none"),
         (ActorCriticCnnPolicy, {}, "none"),
         (ActorCriticCnnPolicy, {}, "class"),
     ],
 )
 def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs, change):
-    """From plain layers, along with the actions, or in one batch."""
+    """Along with the actions, or in one batch."""
     model = make(policy, learning_rate=0.0, policy_kwargs=kwargs)
     CHANGES[change](model.policy)
     buffer = model.learn(1).rollout_buffer
@@ -180,13 +175,70 @@ def test_values_of_the_policy_step_are_those_of_predict_values(policy):
 
 @pytest.mark.parametrize("extractor", [FlattenExtractor, Scaled])
 def test_values_are_those_of_the_policy_that_a_callback_has_set(extractor):
-    """Also of the steps before it, whose values come from plain layers, or had come along with the actions."""
+    """Also of the steps before it, whose values may have come along with the actions."""
     kwargs = {"net_arch": [4], "features_extractor_class": extractor}
     model, other = (make(seed=seed, learning_rate=0.0, policy_kwargs=kwargs) for seed in range(2))
     model.learn(1, At(3, lambda model: setattr(model, "policy", other.policy)))
     with th.no_grad():
         expected = other.policy.predict_values(observations(model.rollout_buffer))
     np.testing.assert_allclose(model.rollout_buffer.values.reshape(-1, 1), expected, rtol=1e-5)
+
+
+def test_values_are_those_of_the_layer_that_a_callback_has_set():
+    model = make(learning_rate=0.0)
+    layer = th.nn.Linear(64, 1)
+    model.learn(1, At(3, lambda model: setattr(model.policy, "value_net", layer)))
+    with th.no_grad():
+        expected = model.policy.predict_values(observations(model.rollout_buffer))
+    assert model.policy.value_net is layer
+    np.testing.assert_allclose(model.rollout_buffer.values.reshape(-1, 1), expected, rtol=1e-5)
+
+
+class ValueStatistics(ActorCriticPolicy):
+    """The critic has batch normalization behind the features."""
+
+    def _build_mlp_extractor(self):
+        super()._build_mlp_extractor()
+        self.mlp_extractor.value_net.append(th.nn.BatchNorm1d(self.mlp_extractor.latent_dim_vf))
+
+
+@pytest.mark.parametrize("step", ["optimizer", "natural"])
+def test_statistics_of_the_critic_move_with_the_features_that_it_shares(step):
+    """The critic's passes are in evaluation mode there, and V is computed with log π, as in the rollout."""
+    model = make(ValueStatistics, step=step, policy_kwargs={"features_extractor_class": Scaled}).learn(1)
+    assert model.policy.mlp_extractor.value_net[-1].num_batches_tracked == 1
+
+
+class Sharpened(MlpExtractor):
+    """``forward`` differs from ``forward_actor``, from which ``get_distribution`` takes its features."""
+
+    def forward(self, features):
+        actor, critic = super().forward(features)
+        return 3 * actor, critic
+
+
+class Inconsistent(ActorCriticPolicy):
+    def _build_mlp_extractor(self):
+        self.mlp_extractor = Sharpened(self.features_dim, [8], th.nn.Tanh)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_log_prob_is_learned_by_the_method_that_acts(frozen):
+    """Also where the critic has no part in the loss, since the features extractor that it shares is frozen."""
+    kwargs = {"features_extractor_class": Scaled, "ortho_init": False}
+    model = make(Inconsistent, learning_rate=0.0, policy_kwargs=kwargs)
+    model.policy.features_extractor.requires_grad_(not frozen)
+    # Log-probabilities are computed for callbacks
+    model.learn(1, callback=lambda *_: True)
+    weights = training_batch(model.rollout, model.rollout_buffer, model.normalize_advantage).weights
+    loss = -(weights * th.as_tensor(model.rollout_buffer.log_probs).flatten()).sum() / model.rollout.denominator
+    assert model.logger.name_to_value["train/policy_loss"] == pytest.approx(float(loss), rel=1e-4)
+
+
+def test_the_natural_step_needs_one_distribution():
+    model = make(Inconsistent, step="natural", policy_kwargs={"features_extractor_class": Scaled})
+    with pytest.raises(ValueError, match="get_distribution of Inconsistent does not give the log π"):
+        model.learn(1)
 
 
 def test_minibatches_of_one_step_are_kept():
