@@ -105,9 +105,8 @@ def landscape(
     """
     Evaluate the utility on a plane through θ.
 
-    :param model: A model with an actor-critic policy, whose parameters are not changed. The environments are reset, so
-        A2C and PPO must not be measured in ``on_step``, and cannot continue their ``learn`` after a measurement that
-        failed
+    :param model: A model with an actor-critic policy; it is not changed. The environments are reset, so A2C and PPO
+        must not be measured in ``on_step``, and cannot continue their ``learn`` after a measurement that failed
     :param gradients: Gradients of the actor's parameters without ``log_std`` to draw, by name, each of shape ``(n,)``,
         or ``(m, n)`` for several estimates of one gradient
     :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,

@@ -41,8 +41,11 @@ def calls(policy: ActorCriticPolicy, method: str, with_values: bool = False) -> 
     """
     if isinstance(policy, RecurrentPolicy):
         return False
-    shares = policy.share_features_extractor and bool(list(policy.features_extractor.parameters()))
-    at_once = with_values and shares and not overrides(policy, "predict_values", "get_distribution")
+    extractor = policy.features_extractor
+    # A user may have replaced one of the three
+    is_shared = extractor is policy.pi_features_extractor is policy.vf_features_extractor
+    saves_work = with_values and is_shared and bool(list(extractor.parameters()))
+    at_once = saves_work and not overrides(policy, "predict_values", "get_distribution")
     return at_once or must_call(policy, method)
 
 

@@ -128,7 +128,7 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
 
 def make_actor(policy: ActorCriticPolicy, calls_forward: bool, n_envs: int, with_log_prob: bool) -> Actor:
     """The fastest actor that acts as the policy would; it may leave out log π without ``with_log_prob``."""
-    # forward returns V too, and takes its features from policy.features_extractor, which a user may have replaced
+    # forward returns V too
     layers = None if calls_forward else plain_actor(policy)
     if layers and has_numpy_form(layers) and takes_vectors(policy, policy.pi_features_extractor):
         return NumpyActor(policy, layers, n_envs, with_log_prob)

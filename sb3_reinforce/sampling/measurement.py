@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.envs.starts import give_new_seeds, start_episodes
 from sb3_reinforce.sampling.normalization import frozen
+
+# Where the distribution of gSDE keeps its noise
+NOISE = ("exploration_mat", "exploration_matrices")
 
 
 @contextmanager
@@ -30,17 +32,25 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     env = cast(VecEnv, model.env)
     # Whatever ends the block, a model without an observation resets its environments before its next rollout
     model._last_obs = None
-    with interruptible(), guard(env), frozen(env):
+    with interruptible(), guard(env), frozen(env), kept_noise(model.policy):
         try:
             yield
         finally:
             give_new_seeds(env)
         obs = env.reset()
-    if model.use_sde:
-        # A2C and PPO draw theirs before on_rollout_start, where they may be measured
-        cast(ActorCriticPolicy, model.policy).reset_noise(env.num_envs)
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
     model._last_obs = obs  # type: ignore[assignment]
+
+
+@contextmanager
+def kept_noise(policy: Any) -> Iterator[None]:
+    """Restore the noise of gSDE after the block: A2C and PPO draw it before ``on_rollout_start``."""
+    attributes = vars(policy.action_dist)
+    noise = {name: attributes[name] for name in NOISE if name in attributes}
+    try:
+        yield
+    finally:
+        attributes.update(noise)
 
 
 def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:

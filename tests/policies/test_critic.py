@@ -194,6 +194,18 @@ def test_values_are_those_of_the_layer_that_a_callback_has_set():
     np.testing.assert_allclose(model.rollout_buffer.values.reshape(-1, 1), expected, rtol=1e-5)
 
 
+def test_an_extractor_that_only_forward_would_use_is_not_used():
+    """``predict`` acts without it."""
+    model = make(learning_rate=0.0)
+    model.policy.features_extractor = Scaled(model.observation_space)
+    model.policy.features_extractor.scale.data.fill_(5.0)
+    buffer = model.learn(1).rollout_buffer
+    with th.no_grad():
+        expected = model.policy.predict_values(observations(buffer)).reshape(N_STEPS, N_ENVS)
+    np.testing.assert_allclose(buffer.values, expected, rtol=1e-4, atol=1e-6)
+    assert model.logger.name_to_value["train/kl"] == pytest.approx(0, abs=1e-6)
+
+
 class ValueStatistics(ActorCriticPolicy):
     """The critic has batch normalization behind the features."""
 
@@ -204,7 +216,7 @@ class ValueStatistics(ActorCriticPolicy):
 
 @pytest.mark.parametrize("step", ["optimizer", "natural"])
 def test_statistics_of_the_critic_move_with_the_features_that_it_shares(step):
-    """The critic's passes are in evaluation mode there, and V is computed with log π, as in the rollout."""
+    """The critic's passes are in evaluation mode. V comes along with log π, which moves the statistics once."""
     model = make(ValueStatistics, step=step, policy_kwargs={"features_extractor_class": Scaled}).learn(1)
     assert model.policy.mlp_extractor.value_net[-1].num_batches_tracked == 1
 
