@@ -20,13 +20,13 @@ CASES = [*itertools.product(ENVS, ["leave_one_out", "value"]), (IdentityEnv, "no
 def test_to_repeat_the_observation(env_class, baseline):
     """Nearly all of the 100 rewards of an episode, from each action space and with and without a critic."""
     box = env_class is IdentityEnvBox
-    env = env_class(eps=0.5) if box else env_class(3)
-    mode = {"n_steps": 32} if baseline == "value" else {"n_episodes": 2}
+    env = make_vec_env(env_class, 8, env_kwargs={"eps": 0.5} if box else {"dim": 3})
+    mode = {"n_steps": 8} if baseline == "value" else {"n_episodes": 8}
     model = REINFORCE(
         "MlpPolicy", env, baseline=baseline, gamma=0.4, learning_rate=5e-3, seed=0, normalize_advantage=True, **mode,
         policy_kwargs={"log_std_init": -0.5} if box else {}, device="cpu",
-    ).learn(8_000)  # fmt: skip
-    mean, _ = evaluate_policy(model, env, n_eval_episodes=10, warn=False)
+    ).learn(16_000)  # fmt: skip
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=16)
     assert mean >= 90
 
 

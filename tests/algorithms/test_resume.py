@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch as th
 from callbacks import At
-from models import KINDS, all_kinds, both, make, plain
+from models import KINDS, both, make, plain
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
@@ -45,16 +45,18 @@ def digest(model, env):
     return state | {name: hashlib.sha256(pickle.dumps(plain(part))).hexdigest() for name, part in parameters}
 
 
-def go_on(kind, folder):
+def go_on(folder):
     """What a fresh process does."""
-    env = VecNormalize.load(str(folder / "statistics.pkl"), make_vec_env("Pendulum-v1", 2, seed=11))
-    algorithm = KINDS[kind][0]
-    model = algorithm.load(folder / "model", env=env, device="cpu", restore_random_state=True)
-    (folder / "end.pkl").write_bytes(pickle.dumps(finish(model, env)))
+    ends = {}
+    for kind, (algorithm, _) in KINDS.items():
+        env = VecNormalize.load(str(folder / f"{kind}.pkl"), make_vec_env("Pendulum-v1", 2, seed=11))
+        model = algorithm.load(folder / kind, env=env, device="cpu", restore_random_state=True)
+        ends[kind] = finish(model, env)
+    (folder / "ends.pkl").write_bytes(pickle.dumps(ends))
 
 
-@all_kinds
-def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
+def half_trained(kind, folder):
+    """A model that has been saved after half of its training, and its environments."""
     schedules = {"learning_rate": LinearSchedule(1e-3, 0, 1)}
     if kind == "steps":
         schedules["ent_coef"] = LinearSchedule(0.01, 0, 1)
@@ -66,15 +68,19 @@ def test_a_fresh_process_ends_where_this_one_does(kind, tmp_path):
     model.learn(TOTAL, At(TOTAL // 4 + 1))
     assert TOTAL // 2 < model.num_timesteps < TOTAL and model._n_updates > 0
     assert kind == "search" or env.ret_rms.count > TOTAL // 2
-    model.save(tmp_path / "model")
-    env.save(tmp_path / "statistics.pkl")
+    model.save(folder / kind)
+    env.save(folder / f"{kind}.pkl")
+    return model, env
+
+
+def test_a_fresh_process_ends_where_this_one_does(tmp_path):
     here = Path(__file__)
     folders = [str(here.parent), str(here.parents[1])]
     code = f"import sys; sys.path[:0] = {folders}; import pathlib, test_resume as t; "
-    code += f"t.th.set_num_threads(1); t.go_on({kind!r}, pathlib.Path({str(tmp_path)!r}))"
-    expected = finish(model, env)
+    code += f"t.th.set_num_threads(1); t.go_on(pathlib.Path({str(tmp_path)!r}))"
+    expected = {kind: finish(*half_trained(kind, tmp_path)) for kind in KINDS}
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert pickle.loads((tmp_path / "end.pkl").read_bytes()) == expected
+    assert pickle.loads((tmp_path / "ends.pkl").read_bytes()) == expected
 
 
 def test_the_generators_are_restored_on_request(tmp_path):

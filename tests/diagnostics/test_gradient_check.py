@@ -118,7 +118,11 @@ def test_the_sign_of_a_mean_that_is_not_trained_does_not_pass_unchecked():
     assert "sign" in table.failures
 
 
-@pytest.mark.parametrize(("n_channels", "memory_format"), [(1, th.contiguous_format), (3, th.channels_last)])
+# A quarter of a minute each
+@pytest.mark.parametrize(
+    ("n_channels", "memory_format"),
+    [pytest.param(1, th.contiguous_format, marks=pytest.mark.slow), (3, th.channels_last)],
+)
 def test_images_pass_with_a_bounded_number_of_them(monkeypatch, n_channels, memory_format):
     env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=n_channels, discrete=True)
     seen, forward = [], NatureCNN.forward

@@ -1,5 +1,6 @@
 """Workers that end in unusual ways: learning ends with an error that names the cause, and nothing hangs."""
 
+import itertools
 import threading
 
 import numpy as np
@@ -9,8 +10,6 @@ from environments import Corridor, Faulty
 from models import both, make
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-# Python warns of fork beside threads; here it is what is tested
-pytestmark = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 KILLED = "was killed by SIGKILL"
 
 
@@ -48,24 +47,27 @@ def kill_worker(model):
     process.join()
 
 
-@pytest.mark.parametrize("kind", ["episodes", "search"])
-@pytest.mark.parametrize(
-    ("start_method", "fault", "end"),
-    [
-        ("fork", "raise in step", "ended with exit code 1"),
-        ("fork", "raise in reset", "ended with exit code 1"),
-        ("fork", "die in step", KILLED),
-        ("fork", "die in reset", KILLED),
-        ("fork", "between two steps", KILLED),
-        ("forkserver", "die in step", KILLED),
-        ("spawn", "raise in step", "ended with exit code 1"),
-    ],
-)
-def test_a_worker_that_dies_is_named(start_method, fault, end, kind, workers, tmp_path):
+FAULTS = {
+    "raise in step": "ended with exit code 1",
+    "raise in reset": "ended with exit code 1",
+    "die in step": KILLED,
+    "die in reset": KILLED,
+    "between two steps": KILLED,
+}
+# Workers that are not forked import PyTorch: one case of each
+DEATHS = [
+    *itertools.product(["episodes", "search"], ["fork"], FAULTS),
+    ("search", "forkserver", "die in step"),
+    ("episodes", "spawn", "raise in step"),
+]
+
+
+@pytest.mark.parametrize(("kind", "start_method", "fault"), DEATHS)
+def test_a_worker_that_dies_is_named(kind, start_method, fault, workers, tmp_path):
     """Also with fork, where the other workers hold its pipe open and a plain step would wait for ever."""
     env = workers(faulty(fault=fault, at=2), start_method)
     model = make(kind, env, **({"common_random_numbers": True} if kind == "search" else {}))
-    with pytest.raises(ConnectionError, match=f"worker of environment 1 died: it {end}"):
+    with pytest.raises(ConnectionError, match=f"worker of environment 1 died: it {FAULTS[fault]}"):
         model.learn(10_000, callback=At(20, kill_worker) if fault == "between two steps" else None)
     env.close()
     assert all(not process.is_alive() for process in env.processes)

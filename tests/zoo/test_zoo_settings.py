@@ -198,12 +198,16 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
     assert memories == ({*MEMORIES} if name == "reinforce_lstm" else set())
 
 
-ENTRIES = [(name, env) for name in ALGORITHMS for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())]
+ENTRIES = [
+    # Its first rollout takes half a minute
+    pytest.param(name, env, marks=[pytest.mark.slow] if env == "CarRacing-v3" else [])
+    for name in ALGORITHMS
+    for env in yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
+    if env not in ("atari", "default", "train_env_kwargs")
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "env"), [entry for entry in ENTRIES if entry[1] not in ("atari", "default", "train_env_kwargs")]
-)
+@pytest.mark.parametrize(("name", "env"), ENTRIES)
 def test_every_entry_trains(name, env, tmp_path):
     try:
         rl_zoo3.utils.gym.make(env).close()
