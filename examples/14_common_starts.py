@@ -53,8 +53,8 @@ def make_model(episodes_per_start, seed):
 # %% [markdown]
 # ## Ask before you train
 #
-# `compare_starts` plays eight episodes from each of some starts. It reports the share of the return's variance between
-# starts, and the factor by which groups reduce the gradient's variance. Below 1, they add noise.
+# `compare_starts` plays eight episodes from each of several starts. It reports the share of the return's variance
+# between starts, and the factor by which groups reduce the gradient's variance. Below 1, they add noise.
 
 # %%
 report = compare_starts(make_model(1, seed), seed=seed)

@@ -43,8 +43,8 @@ model = REINFORCE(
 )
 
 # %% [markdown]
-# Training may take 200,000 steps. Every 4,000 steps 20 episodes of the most likely actions are played, and training
-# stops when they score 490 on average.
+# Training takes at most 200,000 steps. Every 4,000 steps the policy is evaluated on 20 episodes with its most likely
+# actions, and training stops when their mean return is at least 490.
 
 # %%
 until_solved = EvalCallback(

@@ -7,7 +7,7 @@
 # $$\text{forward: } \delta \, \hat g \approx U(\theta + \delta) - U(\theta), \qquad
 #   \text{central: } 2 \delta \, \hat g \approx U(\theta + \delta) - U(\theta - \delta).$$
 #
-# For $n$ parameters these are $n + 1$ and $2n$ evaluations of $U$.
+# For $n$ parameters these take $n + 1$ and $2n$ evaluations of $U$.
 
 # %%
 import matplotlib.pyplot as plt
@@ -45,7 +45,7 @@ th.testing.assert_close(central_difference(bowl, theta, deltas), -2 * theta)
 # ## Curvature against noise
 #
 # A utility is a mean of random returns, so each evaluation carries noise. Let $U(x) = x^2$, measured at $x = 2$ with
-# standard error $\sigma = 0.1$. The forward difference then errs by
+# standard error $\sigma = 0.1$. The root mean square error of the forward difference is then
 #
 # $$\sqrt{\left(\tfrac{\delta}{2} U''\right)^2 + 2 \sigma^2 / \delta^2}:$$
 #

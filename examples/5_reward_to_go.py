@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Which rewards can an action change?
 #
-# Only those that come after it. REINFORCE may weigh the score of step $t$ by the return of the whole episode, or by the
-# reward-to-go $G_t = \sum_{k \geq t} \gamma^{k-t} r_k$. For $\gamma = 1$ the expected gradient is the same; the
+# Only those that come after it. REINFORCE may weight the score of step $t$ by the return of the whole episode, or by
+# the reward-to-go $G_t = \sum_{k \geq t} \gamma^{k-t} r_k$. For $\gamma = 1$ the expected gradient is the same; the
 # variance is not.
 
 # %%
@@ -62,9 +62,9 @@ assert difference.snr.low <= 0 <= difference.snr.high
 # ## Where does the discount go?
 #
 # Ten switches one after the other, each worth 1 if it is turned on. The discounted utility is $U = \sum_t \gamma^t \,
-# \pi(\text{on} \mid t)$, so for a uniform policy its derivative by the logit of "on" at $t$ is $\gamma^t / 4$. The
-# factor $\gamma^t$ comes with `discount_scores=True`. Most libraries leave it out, and so does this package by default:
-# then late actions count as much as early ones.
+# \pi(\text{on} \mid t)$, so for a uniform policy its derivative with respect to the logit of "on" at $t$ is
+# $\gamma^t / 4$. The factor $\gamma^t$ comes with `discount_scores=True`. Most libraries leave it out, and so does this
+# package by default: then late actions count as much as early ones.
 
 
 # %%

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Which baseline leaves the least noise?
 #
-# A baseline $b_t$ is subtracted from the return before it weighs the score. It leaves the expected gradient alone as
+# A baseline $b_t$ is subtracted from the return before it weights the score. It leaves the expected gradient alone as
 # long as it depends neither on the action nor on its consequences. How much noise it removes depends on what it may
 # depend on: nothing, the time, or the state.
 
@@ -25,8 +25,8 @@ th.set_num_threads(1)
 # ## A bandit
 #
 # Two actions with rewards from $N(3, 4)$ and $N(5, 4)$, and gradients of 20 episodes. Here every variance has a
-# formula, for baselines that are known. The optimal baseline is the constant $b$ of least variance. For the return $R$
-# and the score $S$ of an episode, the derivative of $E[\|(R - b) S\|^2]$ by $b$ is 0 at
+# formula, for baselines that are known. The optimal baseline is the constant $b$ that minimizes the variance.
+# For the return $R$ and the score $S$ of an episode, the derivative of $E[\|(R - b) S\|^2]$ with respect to $b$ is 0 at
 #
 # $$b^* = \frac{E[R \, \|S\|^2]}{E[\|S\|^2]},$$
 #

@@ -2,8 +2,8 @@
 # # Where do the estimators point?
 #
 # For $\gamma = 1$, small perturbations and a policy that samples its actions, the likelihood ratio and the finite
-# differences estimate the same gradient. (Page 4 took the most likely actions, whose utility is another one.) First: is
-# it right? Then: which of them sees it from the fewest steps? Last, a picture.
+# differences estimate the same gradient. (Page 4 took the most likely actions, whose utility is another one.) First:
+# are the estimates right? Then: which estimator needs the fewest steps? Last, a picture.
 
 # %%
 import matplotlib.pyplot as plt

@@ -69,14 +69,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     (Williams, 1992, equation 4 and theorems 1 and 2; γ^t only with ``discount_scores``). m_t is 1 for the steps that
     are used: those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
     ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"``,
-    ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True`` and no
-    normalization or clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and
-    Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout, batch normalization and
-    noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
+    ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True``,
+    ``ent_coef=0`` and neither normalized advantages nor clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its
+    steps share noise, and Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout,
+    batch normalization and noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
-    left out, since its return is not known. Then only policies with hooks, or with their own ``forward``,
+    left out, since its return is not known. Without a critic only policies with hooks, or with their own ``forward``,
     ``evaluate_actions`` or ``extract_features``, evaluate the value network.
 
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
@@ -128,8 +128,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param normalize_advantage: Scale G_t − b_t to mean 0 and standard deviation 1 per rollout; skipped below two
         samples and where the deviation is 0
     :param step: ``"optimizer"``, a step of the policy's optimizer, or ``"natural"``, along the natural gradient F⁻¹ ĝ
-        (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of
-        a thousand steps or more. Policies whose log π differs in training mode, as with dropout, are refused
+        (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of at
+        least 1,000 steps in all environments together. Policies whose log π differs in training mode, as with dropout,
+        are refused
     :param target_kl: With ``step="natural"``, the target of the rollout's mean KL(π_before ‖ π_after), which is at most
         1.2 times it, before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes

@@ -30,7 +30,7 @@ class GymnasiumVecEnv(VecEnv):
     ``TimeLimit.truncated``, as with ``DummyVecEnv``. Observations and rewards are checked for their form at each step.
     Wrap it in ``VecMonitor`` to record the episodes from which ``rollout/ep_rew_mean`` is computed. ``seed(s)`` gives
     copy ``i`` the seed ``s + i`` at the next reset, where the vector environment seeds that way. Attributes can only be
-    set for all copies at once, and methods only be called where there are single copies.
+    set for all copies at once, and methods can only be called where each copy is an environment.
 
     :param env: A vector environment with ``autoreset_mode`` ``SAME_STEP`` or ``DISABLED``, or Gymnasium's vectorized
         CartPole, which is then reset within the step

@@ -64,7 +64,7 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     """
     ``[1 Δ] [u₀ ĝ]ᵀ ≈ U(θ + Δ)``: k evaluations, exact on linear utilities, error of order 1 in ‖Δ‖.
 
-    The intercept u₀ is fitted by centring: ``(Δ − Δ̄) ĝ ≈ U − Ū`` has the same ĝ (Frisch and Waugh, 1933). Where there
+    The intercept u₀ is fitted by centering: ``(Δ − Δ̄) ĝ ≈ U − Ū`` has the same ĝ (Frisch and Waugh, 1933). Where there
     are fewer perturbations than unknowns, this is the ĝ of least norm, and the level u₀ is not pulled towards zero.
 
     :param utility: U
