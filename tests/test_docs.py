@@ -7,6 +7,7 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rl_zoo3
@@ -96,15 +97,15 @@ def test_python_blocks_run(name: str, tmp_path: Path, monkeypatch: pytest.Monkey
     exec(compile(script, name, "exec"), {"__name__": "__main__"})
 
 
-def with_budget(command: str) -> tuple[str, ...]:
-    """The words behind ``python``, with the budget of CI: of the options with one name the last counts."""
-    start, *words = shlex.split(command.removeprefix("OMP_NUM_THREADS=1 "))
-    assert start == "python", f"{command} is not run, and ELSEWHERE does not say why"
-    # A module of the Zoo and its command, or a script
-    program = words[: 3 if words[0] == "-m" else 1]
-    options = f"{shlex.join(words[len(program) :])} {BUDGETS[Path(program[-1]).name]}".strip()
-    last = {option.split()[0]: option for option in re.split(r" (?=--?[a-z])", options)}
-    return (*program, *shlex.split(" ".join(last.values())))
+def last_values(words: list[str]) -> frozenset[tuple[str, ...]]:
+    """Each option with its values; where it is repeated, with the last ones."""
+    options: dict[str, list[str]] = {}
+    for word in words:
+        if re.match("--?[a-zA-Z]", word):
+            options[word] = values = [word]
+        else:
+            values.append(word)
+    return frozenset(map(tuple, options.values()))
 
 
 @pytest.mark.parametrize("name", [name for name, found in RUN.items() if found])
@@ -114,14 +115,22 @@ def test_commands_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "benchmarks"))
-    # Some commands differ only in what the budget replaces
-    for program, *options in dict.fromkeys(map(with_budget, RUN[name])):
-        if program == "-m":
-            monkeypatch.setattr(sys, "argv", options)
-            runpy.run_module(options[0], run_name="__main__")
+    runs: dict[Any, list[str]] = {}
+    for command in RUN[name]:
+        start, *words = shlex.split(command.removeprefix("OMP_NUM_THREADS=1 "))
+        assert start == "python", f"{name}: {command} is not run, and ELSEWHERE does not say why"
+        # A module of the Zoo and its command, or a script
+        program = words[: 3 if words[0] == "-m" else 1]
+        options = [*words[len(program) :], *shlex.split(BUDGETS[Path(program[-1]).name])]
+        # Commands that differ only in what the budget replaces are one run, with the options of all
+        runs.setdefault((*program, last_values(options)), [*program]).extend(options)
+    for first, *words in runs.values():
+        if first == "-m":
+            monkeypatch.setattr(sys, "argv", words)
+            runpy.run_module(words[0], run_name="__main__")
         else:
-            monkeypatch.setattr(sys, "argv", [program, *options])
-            runpy.run_path(str(ROOT / program), run_name="__main__")
+            monkeypatch.setattr(sys, "argv", [first, *words])
+            runpy.run_path(str(ROOT / first), run_name="__main__")
 
 
 def test_every_reason_not_to_run_a_command_is_needed() -> None:

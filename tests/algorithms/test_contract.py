@@ -115,11 +115,9 @@ def parameters_after_training(kind, env):
 @all_kinds
 def test_the_same_seed_gives_the_same_parameters(kind):
     """On each kind of VecEnv, and in subprocesses as in this process."""
-    # Forked workers need not import PyTorch
-    subprocess = partial(SubprocVecEnv, start_method="fork")
     dummy, again, subproc = (
         parameters_after_training(kind, make_vec_env("CartPole-v1", 3, vec_env_cls=vec_env_cls))
-        for vec_env_cls in (DummyVecEnv, DummyVecEnv, subprocess)
+        for vec_env_cls in (DummyVecEnv, DummyVecEnv, SubprocVecEnv)
     )
     assert all(map(th.equal, dummy, again)) and all(map(th.equal, dummy, subproc))
     assert all(map(th.equal, *(parameters_after_training(kind, VecMonitor(native(3))) for _ in range(2))))

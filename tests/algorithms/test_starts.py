@@ -322,7 +322,7 @@ def test_a_model_can_be_loaded_for_other_numbers_of_environments(tmp_path):
     REINFORCE.load(tmp_path / "model", env=DummyVecEnv([Scales] * 12), n_episodes=12).learn(12)
 
 
-# The example, which CI runs, asserts the like for one seed
+# The example, which CI runs, asserts something similar for one seed
 @pytest.mark.slow
 def test_half_of_the_episodes_do_where_starts_differ():
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "14_common_starts.py"))

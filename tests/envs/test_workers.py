@@ -10,6 +10,8 @@ from environments import Corridor, Faulty
 from models import both, make
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
+# Python warns of fork beside threads; here it is what is tested
+pytestmark = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 KILLED = "was killed by SIGKILL"
 
 
@@ -54,7 +56,7 @@ FAULTS = {
     "die in reset": KILLED,
     "between two steps": KILLED,
 }
-# Workers that are not forked import PyTorch: one case of each
+# Workers that are not forked import PyTorch, which takes seconds: one case of each start method
 DEATHS = [
     *itertools.product(["episodes", "search"], ["fork"], FAULTS),
     ("search", "forkserver", "die in step"),

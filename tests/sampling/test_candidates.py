@@ -186,8 +186,7 @@ def test_a_queue_without_rounds_leaves_no_environment_idle_while_it_lasts():
 
 WRAPPERS = {
     "DummyVecEnv": lambda: DummyVecEnv([Counting] * 3),
-    # Forked workers need not import PyTorch
-    "SubprocVecEnv": lambda: SubprocVecEnv([Counting] * 3, start_method="fork"),
+    "SubprocVecEnv": lambda: SubprocVecEnv([Counting] * 3),
     "VecNormalize": lambda: VecNormalize(DummyVecEnv([Counting] * 3), training=False),
     "VecFrameStack": lambda: VecFrameStack(DummyVecEnv([Counting] * 3), 2),
 }
