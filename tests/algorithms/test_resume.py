@@ -48,7 +48,7 @@ def digest(model, env):
 def go_on(folder):
     """What a fresh process does."""
     ends = {}
-    # In another order than before, or they could share what a process keeps
+    # In reverse: what an earlier model leaves in the process must not matter
     for kind, (algorithm, _) in reversed(KINDS.items()):
         env = VecNormalize.load(str(folder / f"{kind}.pkl"), make_vec_env("Pendulum-v1", 2, seed=11))
         model = algorithm.load(folder / kind, env=env, device="cpu", restore_random_state=True)
