@@ -99,14 +99,7 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
         now: Any = copy.copy(action_distribution(policy, obs))
 
     def divergence() -> th.Tensor:
-        other = action_distribution(policy, obs)
-        try:
-            kl = kl_divergence(now, other)
-        except (NotImplementedError, AttributeError, AssertionError) as error:
-            raise ValueError(
-                "step='natural' needs a KL divergence between the distributions of the actions, and Stable-Baselines3 "
-                f"and PyTorch compute none for {type(now).__name__}: use step='optimizer'"
-            ) from error
+        kl = kl_divergence(now, action_distribution(policy, obs))
         return kl.sum() / len(kl)
 
     return divergence

@@ -13,7 +13,6 @@ from gymnasium import spaces
 from models import Dropping, Normalized, make
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -329,67 +328,6 @@ def test_a_policy_with_another_distribution_is_refused(policy, extractor, senten
     with pytest.raises(ValueError, match=sentence):
         model.learn(32)
     assert th.equal(to_vector(model.policy.parameters()), before)
-
-
-class HeavyTailed(DiagGaussianDistribution):
-    """PyTorch has no KL divergence between these distributions."""
-
-    def proba_distribution(self, mean_actions, log_std):
-        self.distribution = th.distributions.StudentT(5.0, mean_actions, log_std.exp())
-        return self
-
-
-class OtherName(DiagGaussianDistribution):
-    """Keeps PyTorch's distribution elsewhere than Stable-Baselines3."""
-
-    def proba_distribution(self, mean_actions, log_std):
-        self.normal = super().proba_distribution(mean_actions, log_std).distribution
-        del self.distribution
-        return self
-
-    def log_prob(self, actions):
-        return self.normal.log_prob(actions).sum(1)
-
-    def entropy(self):
-        return self.normal.entropy().sum(1)
-
-    def sample(self):
-        return self.normal.sample()
-
-
-class Parts(DiagGaussianDistribution):
-    """Keeps PyTorch's distribution in a list."""
-
-    def proba_distribution(self, mean_actions, log_std):
-        self.distribution = [super().proba_distribution(mean_actions, log_std).distribution]
-        return self
-
-    def log_prob(self, actions):
-        return self.distribution[0].log_prob(actions).sum(1)
-
-    def entropy(self):
-        return self.distribution[0].entropy().sum(1)
-
-    def sample(self):
-        return self.distribution[0].sample()
-
-
-@pytest.mark.parametrize("distribution", [HeavyTailed, OtherName, Parts])
-def test_a_distribution_without_a_divergence_is_refused(distribution):
-    class Own(ActorCriticPolicy):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            self.action_dist = distribution(1)
-
-    for step in ("optimizer", "natural"):
-        model = REINFORCE(Own, "Pendulum-v1", step=step, n_steps=32, seed=0, device="cpu")
-        before = to_vector(model.policy.parameters())
-        if step == "natural":
-            with pytest.raises(ValueError, match=f"compute none for {distribution.__name__}: use"):
-                model.learn(32)
-        else:
-            model.learn(32)
-        assert th.equal(to_vector(model.policy.parameters()), before) == (step == "natural")
 
 
 EQUAL_RETURNS = {
