@@ -107,12 +107,7 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
 
 def hessian_vector_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
     """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994)."""
-    gradients = th.autograd.grad(output, parameters, create_graph=True, allow_unused=True)
-    if any(gradient is None for gradient in gradients):
-        raise ValueError(
-            "step='natural' needs the distribution of the actions, and get_distribution does not depend on all "
-            "parameters that log π depends on: use step='optimizer'"
-        )
+    gradients = th.autograd.grad(output, parameters, create_graph=True)
     gradient = th.cat([each.flatten() for each in gradients])
     return lambda v: to_vector(th.autograd.grad(gradient @ v, parameters, retain_graph=True))
 

@@ -299,24 +299,10 @@ class Scaled(ActorCriticPolicy):
         return super().get_distribution(obs / 5)
 
 
-class Rescaled(ActorCriticPolicy):
-    """Learns from a parameter that ``get_distribution`` does not have."""
-
-    def _build(self, lr_schedule):
-        super()._build(lr_schedule)
-        self.scale = th.nn.Parameter(th.ones(()))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
-
-    def evaluate_actions(self, obs, actions):
-        values, log_prob, entropy = super().evaluate_actions(obs, actions)
-        return values, log_prob * self.scale, entropy
-
-
 @pytest.mark.parametrize(
     ("policy", "extractor", "sentence"),
     [
         (Scaled, FlattenExtractor, "get_distribution of Scaled does not give the log π"),
-        (Rescaled, FlattenExtractor, "get_distribution does not depend on all"),
         ("MlpPolicy", Dropping, "does not give the log π that it learns from .dropout"),
         ("MlpPolicy", Normalized, "does not give the log π that it learns from .dropout, batch normalization"),
     ],
