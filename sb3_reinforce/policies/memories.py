@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import torch as th
 from torch import nn
 
-from sb3_reinforce.common.arguments import check_choice, check_integer
+from sb3_reinforce.common.arguments import check_choice
 
 State: TypeAlias = tuple[th.Tensor, th.Tensor]
 
@@ -29,18 +29,12 @@ class RNN(AsLstm, nn.RNN):  # type: ignore[misc]
 MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
 
 
-def check_memory(memory: Any, lstm_kwargs: Any, **kwargs: Any) -> None:
-    """Check the arguments of a recurrent policy that Stable-Baselines3 does not know."""
+def check_memory(memory: Any, lstm_kwargs: Any) -> None:
+    """Check the arguments of a recurrent policy that sb3-contrib does not know or check."""
     check_choice("memory", memory, tuple(MEMORIES))
-    for name in ("lstm_hidden_size", "n_lstm_layers"):
-        check_integer(name, kwargs.get(name, 1), 1)
     allowed = {"bias", "dropout"} | ({"nonlinearity"} if memory == "rnn" else set())
     if lstm_kwargs is not None and not (isinstance(lstm_kwargs, dict) and lstm_kwargs.keys() <= allowed):
         raise ValueError(f"lstm_kwargs must be a dict with some of {', '.join(sorted(allowed))}, got {lstm_kwargs!r}")
-    if kwargs.get("shared_lstm") and kwargs.get("enable_critic_lstm", True):
-        raise ValueError("shared_lstm=True needs enable_critic_lstm=False: its critic reads the actor's memory")
-    if kwargs.get("shared_lstm") and not kwargs.get("share_features_extractor", True):
-        raise ValueError("shared_lstm=True needs share_features_extractor=True: its critic reads the actor's memory")
 
 
 def initialize(part: nn.Module, n_hidden: int) -> None:

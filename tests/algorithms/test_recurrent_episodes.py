@@ -72,13 +72,6 @@ def observing(space):
             "must have no memory, got RecurrentActorCriticPolicy",
         ),
         (memory(memory="LSTM"), "memory must be one of 'lstm', 'gru', 'rnn'"),
-        (memory(shared_lstm=True), "shared_lstm=True needs enable_critic_lstm=False"),
-        (
-            memory(shared_lstm=True, enable_critic_lstm=False, share_features_extractor=False),
-            "share_features_extractor",
-        ),
-        (memory(lstm_hidden_size=0), "lstm_hidden_size must be"),
-        (memory(n_lstm_layers=0), "n_lstm_layers must be"),
         (memory(lstm_kwargs={"batch_first": True}), "lstm_kwargs must be a dict with some of bias, dropout"),
         (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
         (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
