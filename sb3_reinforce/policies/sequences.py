@@ -90,25 +90,19 @@ class RecurrentPolicy(ActorCriticPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions and the next state; the arguments are checked first."""
+        """Return the actions and the next state; observation and state are checked first."""
         if isinstance(observation, tuple):
             raise ValueError("observation must not be a tuple: Gymnasium's reset returns the observation and an info")
         obs, _ = self.obs_to_tensor(observation)
         n_layers, _, n_hidden = self.lstm_hidden_state_shape
         n_envs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
-        if isinstance(state, list):
-            state = tuple(state)
-        shapes = [np.shape(part) for part in state] if isinstance(state, tuple) else repr(state)
-        if state is not None and shapes != [(n_layers, n_envs, n_hidden)] * 2:
-            raise ValueError(
-                f"state must be the one that predict returned for these {n_envs} environments, a tuple of two arrays "
-                f"of shape {(n_layers, n_envs, n_hidden)}, or None where episodes start; got {shapes}"
-            )
-        if episode_start is not None:
-            if np.size(episode_start) != n_envs:
-                raise ValueError(f"episode_start must have shape ({n_envs},), got {np.shape(episode_start)}")
-            # One environment alone has one flag, without a dimension
-            episode_start = np.reshape(episode_start, n_envs)
+        if state is not None:
+            shapes = [np.shape(part) for part in state]
+            if shapes != [(n_layers, n_envs, n_hidden)] * 2:
+                raise ValueError(
+                    f"state must be the one that predict returned for these {n_envs} environments, two arrays of shape "
+                    f"{(n_layers, n_envs, n_hidden)}, or None where episodes start; got {shapes}"
+                )
         return super().predict(observation, state, episode_start, deterministic)
 
     def zero_state(self, n_envs: int) -> th.Tensor:

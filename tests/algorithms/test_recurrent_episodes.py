@@ -76,8 +76,6 @@ def observing(space):
         (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
         (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
         (predict(THREE, TWO_STATES), r"state must be .* of shape \(1, 3, 4\)"),
-        (predict(THREE, 3), "state must be .*; got 3"),
-        (predict(THREE, None, np.ones(2, dtype=bool)), r"episode_start must have shape \(3,\), got \(2,\)"),
         (predict((THREE, {})), "observation must not be a tuple"),
     ],
 )
