@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence
 from torch.utils.checkpoint import checkpoint
@@ -64,17 +64,10 @@ class RecurrentPolicy(ActorCriticPolicy):
         # sb3-contrib leaves them out, and a policy that is loaded would have other shapes
         return super()._get_constructor_parameters() | self.memory_arguments
 
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Make a features extractor, and refuse one whose size PyTorch's memories do not take."""
-        extractor = super().make_features_extractor()
-        size = extractor.features_dim
-        if not isinstance(size, int):
-            raise ValueError(
-                "observation_space must have features whose number is an int for a policy with a memory, got "
-                f"{self.observation_space}, for which {type(extractor).__name__} has features_dim={size!r}: give "
-                "MultiDiscrete observations as a Box, or make features_dim an int"
-            )
-        return extractor
+    def _build(self, lr_schedule: Schedule) -> None:
+        # PyTorch's memories take no NumPy integer, which it is for MultiDiscrete observations
+        self.features_dim = int(self.features_dim)
+        super()._build(lr_schedule)
 
     def set_training_mode(self, mode: bool) -> None:
         """Set the mode; memories without dropout stay in training mode, since cuDNN has no other backward pass."""
