@@ -148,10 +148,6 @@ def test_only_discrete_actions_can_be_masked(space, algorithm):
 def test_an_environment_needs_action_masks():
     with pytest.raises(TypeError, match=r"env must have a method action_masks\(\) .*got <Random"):
         ActionMaskObservation(Random(VECTOR))
-    attribute = Masked(VECTOR)
-    attribute.action_masks = np.ones(2, dtype=bool)
-    with pytest.raises(TypeError, match=r"env must have a method action_masks\(\)"):
-        ActionMaskObservation(attribute)
     with pytest.raises(ValueError, match="must not have the key 'action_mask' yet"):
         ActionMaskObservation(environment())
 
@@ -205,7 +201,7 @@ def test_a_masked_policy_needs_masks_and_observations(space, algorithm):
         ("discrete", [0.0, -np.inf, 0.0, 0.0, 0.0], "must return 5 booleans"),
         ("discrete", [1, 2, 0, 0, 0], "must return 5 booleans"),
         ("discrete", [False] * 5, "must allow an action of Discrete(5) until the episode is over, got [False, "),
-        ("multidiscrete", [[True] * 2, [True] * 4, [True] * 3], "must return 9 booleans in a row for MultiDiscrete"),
+        ("multidiscrete", [True] * 5, "must return 9 booleans in a row for MultiDiscrete"),
         ("multidiscrete", [True] * 6 + [False] * 3, "must allow an action in each dimension of MultiDiscrete"),
     ],
 )
