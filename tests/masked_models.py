@@ -1,7 +1,6 @@
 """Models with action masks, and environments that refuse forbidden actions."""
 
 import numpy as np
-import pytest
 from environments import Random
 from gymnasium import spaces
 from sb3_contrib import TRPO
@@ -64,6 +63,3 @@ def make(algorithm, env, **kwargs):
     fixed = {"seed": 0, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
     policy = MaskedLstmPolicy if cls is RecurrentREINFORCE else MaskedPolicy
     return cls(policy, env, **{**fixed, **arguments, **kwargs})
-
-
-algorithms = pytest.mark.parametrize("algorithm", ALGORITHMS)

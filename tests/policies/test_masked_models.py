@@ -8,18 +8,22 @@ import torch as th
 from environments import Random
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from masked_models import ALGORITHMS, TASKS, VECTOR, Masked, algorithms, environment, make, two_environments
+from masked_models import ALGORITHMS, TASKS, VECTOR, Masked, environment, make, two_environments
 from models import plain
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE, ActionMaskObservation, GymnasiumVecEnv, MaskedPolicy
 from sb3_reinforce.diagnostics import PitfallCallback, check_gradient, compare_baselines, compare_estimators
 from sb3_reinforce.policies.masks import sizes_of
+
+# A2C and TRPO use a policy as PPO does. For what a policy refuses, its two classes are enough
+some_algorithms = pytest.mark.parametrize("algorithm", ["reinforce", "search", "ppo", "recurrent"])
+both_policies = pytest.mark.parametrize("algorithm", ["ppo", "recurrent"])
 
 
 @pytest.mark.parametrize("algorithm", ["reinforce", "search"])
@@ -28,7 +32,7 @@ def test_the_policy_has_a_name(algorithm):
     assert type(cls("MaskedPolicy", environment(), **arguments).policy) is MaskedPolicy
 
 
-@algorithms
+@some_algorithms
 def test_going_on_from_a_file_is_bit_for_bit_never_having_stopped(algorithm, tmp_path):
     def finish(model):
         model.set_env(two_environments(seed=5))
@@ -67,20 +71,12 @@ VEC_ENVS = {
 }
 
 
-@algorithms
+@some_algorithms
 @pytest.mark.parametrize("vec_env", VEC_ENVS)
 def test_masks_reach_the_policy_through_every_vec_env(vec_env, algorithm):
     env, eval_env = VEC_ENVS[vec_env](), VEC_ENVS[vec_env]()
     model = make(algorithm, env).learn(150, EvalCallback(eval_env, eval_freq=50, n_eval_episodes=2, warn=False))
     assert model.num_timesteps >= 150
-
-
-def test_masks_are_made_in_the_workers():
-    env = two_environments(vec_env_cls=SubprocVecEnv)
-    rollout = make("reinforce", env).learn(150).rollout
-    env.close()
-    masks = rollout.observations["action_mask"]
-    assert not masks.all() and masks.gather(2, rollout.actions.long()).all()
 
 
 def test_a_mask_is_not_normalized():
@@ -133,7 +129,7 @@ def test_the_randomness_of_a_nearly_uniform_policy_is_near_one_whenever_it_has_a
     assert [update.randomness for update in callback.updates] == pytest.approx([1.0, 1.0], abs=0.02)
 
 
-@pytest.mark.parametrize("algorithm", [*ALGORITHMS])
+@both_policies
 @pytest.mark.parametrize("space", [spaces.MultiBinary(3), spaces.Box(-1, 1, (2,))])
 def test_only_discrete_actions_can_be_masked(space, algorithm):
     env = Masked(VECTOR)
@@ -152,7 +148,7 @@ def test_an_environment_needs_action_masks():
         ActionMaskObservation(environment())
 
 
-@algorithms
+@both_policies
 def test_an_evaluation_needs_masks_too(algorithm):
     model = make(algorithm, environment())
     for obs in (VECTOR.sample(), {"observation": VECTOR.sample()}):
@@ -174,7 +170,7 @@ def test_a_user_may_build_another_network():
     evaluate_policy(model, env, n_eval_episodes=4, warn=False)
 
 
-@algorithms
+@both_policies
 @pytest.mark.parametrize(
     "space",
     [
@@ -232,7 +228,7 @@ class Ended(Masked):
         return super().action_masks()
 
 
-@algorithms
+@some_algorithms
 def test_an_environment_is_not_asked_for_the_actions_of_a_terminal_state(algorithm):
     def ended():
         return ActionMaskObservation(Ended(*TASKS["discrete"], lengths=(3,), truncate=False))
