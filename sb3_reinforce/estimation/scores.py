@@ -95,7 +95,7 @@ def sums_by_factors(
     policy = rollout.policy
     obs, actions = used_inputs(rollout)
     features = extract_features(policy, obs, policy.pi_features_extractor).detach()
-    widest = max(parameter.shape[0] for parameter in parameters)
+    widest = max(layer.out_features for layer in layers if isinstance(layer, nn.Linear))
     n_at_once = max(1, min(STEPS, chunk // (len(w) * widest)))
     episode, order = episode.sort(stable=True)
     for steps, episodes in zip(th.split(order, n_at_once), th.split(episode, n_at_once), strict=True):
@@ -160,13 +160,8 @@ def factored_layers(policy: ActorCriticPolicy) -> list[nn.Module] | None:
     if layers is None:
         return None
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    if len(set(parameters)) < len(parameters):
-        return None
-    if isinstance(policy.action_dist, DiagGaussianDistribution):
-        log_std = policy.log_std
-        if not isinstance(log_std, nn.Parameter) or log_std.dim() != 1:
-            return None
-    return layers
+    # A parameter of two layers has two pairs of factors
+    return layers if len(set(parameters)) == len(parameters) else None
 
 
 def score_factors(
@@ -189,7 +184,7 @@ def score_factors(
         factors[layer.bias] = (delta, ones)
     if log_std:
         # One log_std may serve several actions
-        factors[policy.log_std] = (deltas[-1].sum_to_size(len(actions), *policy.log_std.shape), ones)
+        factors[policy.log_std] = (deltas[-1].sum_to_size(len(actions), policy.log_std.numel()), ones)
     return factors
 
 
