@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -55,9 +56,13 @@ def assert_as_one_by_one(rollout, **kwargs):
 
 
 @pytest.mark.parametrize(
-    "action_space", [spaces.Discrete(3), BOX, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], ids=str
+    ("action_space", "chunk"),
+    [
+        *product([spaces.Discrete(3), BOX, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], [2**25]),
+        (BOX, 1),
+    ],
+    ids=str,
 )
-@pytest.mark.parametrize("chunk", [1, 2**25])
 def test_every_action_space_and_any_memory(action_space, chunk):
     """Short and long episodes, in environments that go on after their quota."""
     env = make_vec_env(lambda: Corridor((1, 7, 259), action_space=action_space), 2, seed=0)

@@ -247,12 +247,6 @@ def test_log_prob_is_learned_by_the_method_that_acts(frozen):
     assert model.logger.name_to_value["train/policy_loss"] == pytest.approx(float(loss), rel=1e-4)
 
 
-def test_the_natural_step_needs_one_distribution():
-    model = make(Inconsistent, step="natural", policy_kwargs={"features_extractor_class": Scaled})
-    with pytest.raises(ValueError, match="get_distribution of Inconsistent does not give the log π"):
-        model.learn(1)
-
-
 def test_minibatches_of_one_step_are_kept():
     model = make(n_critic_updates=1, batch_size=1)
     sizes = []
