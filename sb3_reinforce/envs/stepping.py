@@ -10,7 +10,6 @@ from types import NoneType
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
@@ -25,10 +24,6 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
-    # An array with the Box's dtype and shape needs no further check
-    is_box = isinstance(env.observation_space, spaces.Box)
-    rows: Any = env.buf_obs[None] if is_box else np.empty(0)  # type: ignore[index]
-    form = (rows.dtype, rows.shape[1:])
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
@@ -41,10 +36,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        if is_box and type(obs) is np.ndarray and (obs.dtype, obs.shape) == form:
-            rows[i] = obs
-        else:
-            write(env, i, obs)
+        write(env, i, obs)
         infos.append(info)
     env.buf_infos = infos
     return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
