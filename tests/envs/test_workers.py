@@ -56,12 +56,8 @@ FAULTS = {
     "die in reset": KILLED,
     "between two steps": KILLED,
 }
-# Workers that are not forked import PyTorch, which takes seconds: one case of each start method
-DEATHS = [
-    *itertools.product(["episodes", "search"], ["fork"], FAULTS),
-    ("search", "forkserver", "die in step"),
-    ("episodes", "spawn", "raise in step"),
-]
+# Workers that are not forked import PyTorch, which takes seconds: one case of Stable-Baselines3's default
+DEATHS = [*itertools.product(["episodes", "search"], ["fork"], FAULTS), ("search", "forkserver", "die in step")]
 
 
 @pytest.mark.parametrize(("kind", "start_method", "fault"), DEATHS)
@@ -158,8 +154,6 @@ def test_an_answer_that_cannot_be_unpickled_is_not_waited_for_again(workers):
     assert env.closed
 
 
-@pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
-@pytest.mark.parametrize("value", [np.zeros(8, np.float32), "x", np.ones(7) * 1j], ids=["long", "string", "complex"])
 @pytest.mark.parametrize(
     ("fault", "step", "what"),
     [
@@ -169,8 +163,8 @@ def test_an_answer_that_cannot_be_unpickled_is_not_waited_for_again(workers):
         (dict(fault="reward", at=5), 4, "reward of environment 1 must be a number"),
     ],
 )
-def test_malformed_observations_and_rewards_are_named(fault, step, what, value, wrapper, workers):
-    model = make("steps", wrapper(workers(faulty(value=value, **fault))))
+def test_malformed_observations_and_rewards_are_named(fault, step, what, workers):
+    model = make("steps", VecNormalize(workers(faulty(value=np.zeros(8), **fault))))
     with pytest.raises(ValueError, match=rf"{what}.*\(num_timesteps={3 * step}\)"):
         model.learn(400)
 
