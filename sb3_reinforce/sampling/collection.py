@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -91,14 +91,12 @@ def collect(
     them, or ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
-    # A user may have set numbers
-    model._last_episode_starts = np.asarray(model._last_episode_starts, dtype=bool)
     # For callback=None Stable-Baselines3 installs a no-op, which need not be called
     is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
     has_values = calls(policy, "forward", with_critic)
     actor = actor_of(has_values, is_attached)
     as_env_actions = env_actions_of(policy)
-    starts = [model._last_episode_starts.copy()]
+    starts = [cast(Bools, model._last_episode_starts)]
     terminal_obs: TerminalObs = {}
     n_steps = first_row = 0
     while n_steps < extent.n_steps and not extent.is_complete:
@@ -126,7 +124,7 @@ def collect(
         rollout_buffer.rewards[n_steps] = rewards
         # Copies as booleans: some VecEnvs return numbers, or reuse the array
         starts.append(dones.astype(bool))
-        model._last_episode_starts = starts[-1].copy()
+        model._last_episode_starts = starts[-1]
         n_steps += 1
         rollout_buffer.pos = n_steps
         if dones.any():

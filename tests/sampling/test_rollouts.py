@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.estimation import BASELINES
-from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 CUTS = "ignore:Episodes that n_steps cuts"
 
@@ -290,26 +289,6 @@ def test_training_sees_the_fractions_that_the_policy_saw_and_drew(dictionary):
     flat = observations.flatten(0, 1)
     _, log_prob, _ = model.policy.evaluate_actions({"a": flat} if dictionary else flat, rollout.actions.flatten(0, 1))
     np.testing.assert_allclose(log_prob.detach(), model.rollout_buffer.log_probs.flatten(), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("algorithm", [REINFORCE, RecurrentREINFORCE])
-def test_episode_starts_that_a_callback_writes(algorithm):
-    """At a step they are not recorded as ends; before a rollout they may be numbers."""
-
-    def write(model):
-        model._last_episode_starts[:] = True
-
-    def convert(model):
-        model._last_episode_starts = model._last_episode_starts.astype(int)
-
-    policy = "MlpPolicy" if algorithm is REINFORCE else "MlpLstmPolicy"
-    models = [
-        algorithm(policy, Corridor((7,)), n_steps=8, seed=0, device="cpu").learn(16, callbacks)
-        for callbacks in ([], [Record(write, at="step"), Record(convert, at="rollout_start")])
-    ]
-    assert models[1].rollout.dones[:, 0].nonzero().tolist() == [[5]]
-    for ours, theirs in zip(*(model.policy.parameters() for model in models), strict=True):
-        assert th.equal(ours, theirs)
 
 
 def test_a_later_episode_has_its_full_length_where_another_environment_has_finished():
