@@ -54,8 +54,6 @@ class GymnasiumVecEnv(VecEnv):
         if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
         obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
-        if not isinstance(infos, dict):
-            raise ValueError(f"{self.env} must return infos as a dict of arrays, not as a {type(infos).__name__}")
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()

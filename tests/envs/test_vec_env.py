@@ -8,7 +8,7 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import TransformAction, TransformReward
-from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from models import make
 from packaging.version import Version
 from stable_baselines3 import A2C, PPO
@@ -280,12 +280,6 @@ def test_episodes_may_end_by_numbers(form):
     for _ in range(30):
         for ours, theirs in zip(step(numbers)[:3], step(plain)[:3], strict=True):
             np.testing.assert_array_equal(ours, theirs)
-
-
-def test_a_list_of_infos_is_refused():
-    env = SyncVectorEnv([Corridor] * N_ENVS, autoreset_mode=AutoresetMode.SAME_STEP)
-    with pytest.raises(ValueError, match="must return infos as a dict of arrays, not as a list"):
-        GymnasiumVecEnv(DictInfoToList(env)).reset()
 
 
 @pytest.mark.parametrize("form", [list, lambda obs: obs.astype(np.float64)])
