@@ -111,9 +111,7 @@ class GymnasiumVecEnv(VecEnv):
         elif hasattr(self.env.unwrapped, "get_attr"):
             values = self.env.unwrapped.get_attr(attr_name)
         else:
-            # Gymnasium's wrappers do not pass attributes on
-            owner = self.env if hasattr(self.env, attr_name) else self.env.unwrapped
-            values = [getattr(owner, attr_name)] * self.num_envs
+            values = [getattr(self.env.unwrapped, attr_name)] * self.num_envs
         return [values[i] for i in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
