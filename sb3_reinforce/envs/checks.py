@@ -1,7 +1,6 @@
 """Checks of what environments return. Each error names the environment; ``learn`` adds ``num_timesteps``."""
 
 from collections.abc import Mapping
-from decimal import Decimal
 from numbers import Real
 from typing import Any
 
@@ -47,7 +46,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 def as_reward(reward: Any, env: int) -> float:
     """Convert the reward of an environment, which must be one number, to a float."""
     values = np.asarray(reward.detach().cpu() if isinstance(reward, th.Tensor) else reward)
-    if values.size != 1 or not isinstance(values.item(), Decimal | Real):
+    if values.size != 1 or not isinstance(values.item(), Real):
         raise BadData(f"The reward of environment {env} must be a number, got {reward!r}")
     return float(values.item())
 
