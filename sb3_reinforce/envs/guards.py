@@ -74,18 +74,11 @@ def guard(env: VecEnv | None) -> Iterator[None]:
 
 def replace(stack: ExitStack, env: VecEnv, name: str, method: Callable[[], Any]) -> None:
     """Replace a method of this instance until the stack is left; a copy of the VecEnv stays guarded."""
-    own = vars(env)
-    before = own.get(name)
-    own[name] = method
-
-    def restore() -> None:
-        # A user may have replaced it since, for good
-        if own.get(name) is method:
-            own.pop(name)
-            if before is not None:
-                own[name] = before
-
-    stack.callback(restore)
+    if name in vars(env):
+        stack.callback(setattr, env, name, getattr(env, name))
+    else:
+        stack.callback(delattr, env, name)
+    setattr(env, name, method)
 
 
 def finite_step(step: Callable[[], VecEnvStepReturn]) -> VecEnvStepReturn:
