@@ -53,15 +53,11 @@ class Recording(VecNormalize):
 WIDE = spaces.Box(-INF, INF, (7,), np.float64)
 NOT_FINITE = {
     "reward nan": dict(fault="reward", at=20, value=NAN),
-    "reward -inf": dict(fault="reward", at=20, value=-INF),
     "observation nan": dict(fault="observation", at=20, value=bad(NAN)),
-    "observation inf": dict(fault="observation", at=20, value=bad(INF)),
-    "first observation": dict(fault="first observation", at=2, value=bad(NAN)),
-    "later first observation": dict(fault="first observation", at=4, value=bad(INF)),
+    "first observation": dict(fault="first observation", at=4, value=bad(INF)),
     "reset before training": dict(fault="first observation", at=1, value=bad(NAN)),
     "in the first update": dict(fault="reward", at=4, value=NAN),
     "reward beyond float32": dict(fault="reward", at=20, value=1e200),
-    "reward below float32": dict(fault="reward", at=20, value=-1e60),
     "observation below float32": dict(fault="observation", at=20, value=np.full(7, -1e200), observation_space=WIDE),
 }
 WRAPPERS = {
@@ -230,12 +226,10 @@ class Copyable(Wrapper):
         vars(self).update(state)
 
 
-@all_kinds
 @pytest.mark.parametrize("copied", [deepcopy, lambda env: cloudpickle.loads(cloudpickle.dumps(env))])
-@pytest.mark.parametrize("wrapper", [lambda env: env, Copyable])
-def test_a_copy_that_a_callback_makes_is_independent(wrapper, copied, kind):
+def test_a_copy_that_a_callback_makes_is_independent(copied):
     """It moves no other environment, and its rewards are its own; it is guarded too."""
-    env = VecNormalize(wrapper(of_two()))
+    env = VecNormalize(Copyable(of_two()))
 
     def act(model):
         before, copy = env.get_attr("n_steps"), copied(env.venv)
@@ -249,7 +243,7 @@ def test_a_copy_that_a_callback_makes_is_independent(wrapper, copied, kind):
         with pytest.raises(ValueError, match="reward of environment 1 must be a number"):
             make("steps", copy).learn(8)
 
-    assert make(kind, env).learn(40, callback=At(3, act)).num_timesteps >= 40
+    assert make("steps", env).learn(40, callback=At(3, act)).num_timesteps >= 40
 
 
 @all_kinds
