@@ -34,6 +34,9 @@ from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.sampling.candidate_actors import LoopActor, MatrixActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import evaluate_candidates
 
+# Python warns of fork beside threads; other start methods import PyTorch, which takes seconds
+pytestmark = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+
 BOX = spaces.Box(-1, 1, (3,))
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
 ACTIONS = [
@@ -189,7 +192,7 @@ def test_a_queue_without_rounds_leaves_no_environment_idle_while_it_lasts():
 
 WRAPPERS = {
     "DummyVecEnv": lambda: DummyVecEnv([Counting] * 3),
-    "SubprocVecEnv": lambda: SubprocVecEnv([Counting] * 3),
+    "SubprocVecEnv": lambda: SubprocVecEnv([Counting] * 3, start_method="fork"),
     "VecNormalize": lambda: VecNormalize(DummyVecEnv([Counting] * 3), training=False),
     "VecFrameStack": lambda: VecFrameStack(DummyVecEnv([Counting] * 3), 2),
 }
