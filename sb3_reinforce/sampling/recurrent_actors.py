@@ -39,7 +39,7 @@ class RecurrentPolicyActor(PolicyActor):
 
     def is_current(self, policy: Any) -> bool:
         """Whether the policy would still act as this actor does."""
-        return policy is self.policy and numpy_head(policy) is None
+        return policy is self.policy
 
 
 class LstmActor(NumpyActor):
