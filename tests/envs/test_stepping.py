@@ -6,7 +6,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from models import all_kinds
 from models import make as make_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -88,9 +87,8 @@ def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
     assert sum(dones.sum() for (_, _, dones, _), _ in returned) > 50
 
 
-@all_kinds
 @pytest.mark.parametrize("method", ["step", "step_async", "step_wait", "reset"])
-def test_methods_of_the_users_own_are_called(method, kind):
+def test_methods_of_the_users_own_are_called(method):
     """Whether a subclass overrides them, or the user replaces them on one VecEnv."""
     calls = []
 
@@ -99,9 +97,9 @@ def test_methods_of_the_users_own_are_called(method, kind):
         return getattr(DummyVecEnv, method)(self, *args)
 
     subclass = type("Own", (DummyVecEnv,), {method: own})
-    make_model(kind, subclass([lambda: Drawn("box")])).learn(8)
+    make_model("steps", subclass([lambda: Drawn("box")])).learn(8)
     n_calls = len(calls)
     env = make("box")
     setattr(env, method, lambda *args: own(env, *args))
-    make_model(kind, env).learn(8)
+    make_model("steps", env).learn(8)
     assert 0 < n_calls < len(calls) and method in vars(env)
