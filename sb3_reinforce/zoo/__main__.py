@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
-from huggingface_hub.errors import HTTPError
 from rl_zoo3 import utils
 
 from sb3_reinforce.common.arguments import unknown_name
@@ -95,15 +94,11 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         known.add_argument(name)
     known.add_argument("-f", "--folder", default="rl-trained-agents")
     known.add_argument("-i", "--trained-agent")
-    known.add_argument("--log-dir", default="rl-trained-agents/")
-    for name in ("--no-hub", "--load-best", "--load-last-checkpoint"):
+    for name in ("--load-best", "--load-last-checkpoint"):
         known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         known.add_argument(*names, nargs="+", type=key_and_value, default=[])
     given, _ = known.parse_known_args(arguments)
-    if command == "benchmark":
-        check_benchmark(parser, given)
-        return
     if given.algo not in utils.ALGOS:
         parser.error(str(unknown_name("--algo", "one of", utils.ALGOS, given.algo)))
     if given.env not in gym.registry:
@@ -140,19 +135,6 @@ def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.N
             )
 
 
-def check_benchmark(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """Exit with a sentence where the benchmark would find no models."""
-    if not os.path.isdir(given.log_dir):
-        parser.error(f"--log-dir {given.log_dir} is not a folder: pass the folder of your models, such as logs")
-    if not given.no_hub:
-        try:
-            utils.get_hf_trained_models()
-        except (OSError, HTTPError) as error:
-            parser.error(f"the Hugging Face hub does not answer ({error}): pass --no-hub")
-    elif not utils.get_trained_models(given.log_dir):
-        parser.error(f"--log-dir {given.log_dir} holds no trained models: pass the folder that train has written")
-
-
 def main() -> None:
     """Run one of the Zoo's commands with the arguments of the command line."""
     parser = argparse.ArgumentParser(
@@ -166,7 +148,7 @@ def main() -> None:
         parser.error(str(unknown_name("the command", "one of", COMMANDS, command)))
     arguments = sys.argv[2:]
     try:
-        if command not in PLOTS and not {"-h", "--help"} & {*arguments}:
+        if command in ("train", "enjoy", "record_video") and not {"-h", "--help"} & {*arguments}:
             arguments = import_packages(command, arguments)
             check(parser, command, arguments)
         sys.argv = [f"{parser.prog} {command}", *arguments]

@@ -15,7 +15,6 @@ import rl_zoo3
 import stable_baselines3
 import torch as th
 import yaml
-from huggingface_hub.errors import HTTPError
 from matplotlib import pyplot
 from rl_zoo3.exp_manager import ExperimentManager
 from zoo_commands import NAMES, RUN, config_of, message_of, train, zoo
@@ -300,20 +299,12 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         # A temperature in the default entry is left out, but not one that was asked for
         ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
-        (["benchmark"], "--log-dir rl-trained-agents/ is not a folder"),
-        (["benchmark", "--log-dir", ".", "--no-hub"], "--log-dir . holds no trained models"),
     ],
 )
 def test_a_wrong_command_is_answered_with_a_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("broken.py").write_text("hyperparams = {")
     assert sentence in message_of(capsys, *arguments)
-
-
-@pytest.mark.parametrize("error", [ConnectionError("no network"), HTTPError("no network")])
-def test_a_benchmark_without_network_says_to_pass_no_hub(error, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(rl_zoo3.utils, "get_hf_trained_models", mock.Mock(side_effect=error))
-    assert "does not answer (no network): pass --no-hub" in message_of(capsys, "benchmark", "--log-dir", str(tmp_path))
 
 
 def test_plots_of_runs_that_cannot_be_compared_say_what_to_do(monkeypatch, capsys):
