@@ -71,11 +71,6 @@ def test_a_model_card_of_an_environment_in_a_namespace(tmp_path, monkeypatch):
     assert card.parent.name == "own-Pole-v0_1" and "--env own/Pole-v0" in card.read_text()
 
 
-def test_a_model_card_names_the_classes_of_the_settings(tmp_path):
-    train("reinforce", "-n", "64", "-f", str(tmp_path), "-params", "policy_kwargs:dict(activation_fn=nn.ReLU)")
-    assert "activation.ReLU" in write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
-
-
 def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
     folder = ("-f", str(tmp_path))
     settings = ("learning_rate:0.01", "policy_kwargs:dict(net_arch=[8],activation_fn=nn.ReLU)")
