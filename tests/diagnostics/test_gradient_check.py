@@ -18,18 +18,18 @@ from sb3_reinforce.diagnostics import check_gradient
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 
-@pytest.mark.parametrize("action_space", ACTION_SPACES)
 @pytest.mark.parametrize(
-    "kwargs",
+    ("action_space", "kwargs"),
     [
-        {},
-        {"gae_lambda": 0.7},
-        {"gae_lambda": 0.0},
-        {"baseline": "optimal"},
-        {"baseline": "mean", "reward_to_go": False},
+        *((action_space, {}) for action_space in ACTION_SPACES),
+        # Returns and weights do not depend on the actions
+        (ACTION_SPACES[0], {"gae_lambda": 0.7}),
+        (ACTION_SPACES[0], {"gae_lambda": 0.0}),
+        (ACTION_SPACES[0], {"baseline": "optimal"}),
+        (ACTION_SPACES[0], {"baseline": "mean", "reward_to_go": False}),
     ],
 )
-def test_every_action_space_passes(action_space, kwargs):
+def test_every_action_space_and_every_kind_of_weights_passes(action_space, kwargs):
     env = make_vec_env(lambda: corridor(action_space), 2, seed=0)
     table = check_gradient(REINFORCE("MlpPolicy", env, device="cpu", seed=0, gamma=0.9, **kwargs))
     assert table.passed, table
@@ -41,7 +41,7 @@ def test_equal_returns_pass(baseline):
     """Their mean differs from each by rounding."""
     env = make_vec_env(lambda: Corridor((5,)), 2, seed=0)
     model = REINFORCE("MlpPolicy", env, baseline=baseline, gamma=0.99, reward_to_go=baseline != "mean", device="cpu")
-    assert all(check_gradient(model, n_episodes=n).passed for n in range(3, 9))
+    assert all(check_gradient(model, n_episodes=n).passed for n in (3, 7))
 
 
 def two_episodes(env, policy="MlpPolicy", **kwargs):
@@ -138,10 +138,9 @@ def test_gsde_cuts_its_scores_unless_it_learns_features():
     assert check_gradient(model).passed
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_memory_that_larger_weights_would_make_explode_passes(seed):
+def test_a_memory_that_larger_weights_would_make_explode_passes():
     memory = {"memory": "rnn", "lstm_hidden_size": 64, "lstm_kwargs": {"nonlinearity": "relu"}}
-    model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=seed)
+    model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=0)
     assert check_gradient(model).passed
 
 
