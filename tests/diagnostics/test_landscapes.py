@@ -32,24 +32,24 @@ def bandit(algorithm=REINFORCE, **kwargs):
 @pytest.mark.parametrize("temperature", [1.0, 0.2])
 def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(temperature):
     model = bandit(temperature=temperature)
-    utility = CandidateUtility(model, 1000, seed=0)
+    utility = CandidateUtility(model, 400, seed=0)
     thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0 * temperature])
     with th.no_grad():
         expected = float(model.policy.get_distribution(th.ones(1, 1)).distribution.logits.diff())
     expected = [1 / (1 + np.exp(-expected - 2.0 * x)) for x in (0, 1, -1)]
-    np.testing.assert_allclose(utility(thetas).numpy(), expected, atol=0.06)
-    assert utility.n_steps >= 3000
+    np.testing.assert_allclose(utility(thetas).numpy(), expected, atol=0.1)
+    assert utility.n_steps >= 1200
     assert utility(thetas.reshape(1, 3, -1)).shape == (1, 3)
 
 
 def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
     """Asked of a model with γ = ½, which is set aside."""
-    gradients, n_steps = likelihood_ratio(make_model(), 4000)
+    gradients, n_steps = likelihood_ratio(make_model(), 1000)
     truth = true_gradient(Tree().trajectories(), lambda episode: sum(reward for _, _, reward in episode))
-    assert gradients.shape == (4000, 6)
-    assert n_steps == 8000
+    assert gradients.shape == (1000, 6)
+    assert n_steps == 2000
     error = gradients.mean(0) - truth.T.flatten()
-    assert (error.abs() <= 4.5 * gradients.std(0) / 4000**0.5).all()
+    assert (error.abs() <= 4.5 * gradients.std(0) / 1000**0.5).all()
 
 
 def test_the_likelihood_ratio_has_the_mean_of_the_others_as_baseline():
@@ -314,15 +314,15 @@ def test_baselines_without_variance_are_drawn(tmp_path):
 
 
 def test_the_utility_of_a_policy_with_gsde_has_new_noise_in_each_step():
-    """The reward is the action, whose mean is 0: the mean of 2000 returns does not depend on one noise matrix."""
+    """The reward is the action, whose mean is 0: the mean of 1000 returns does not depend on one noise matrix."""
     env = make_vec_env(lambda: Corridor((1,), lambda t, action: float(action[0]), spaces.Box(-1e3, 1e3, (1,))), 8)
     policy_kwargs = {"net_arch": [], "log_std_init": 0.0}
     model = REINFORCE("MlpPolicy", env, use_sde=True, sde_sample_freq=1, policy_kwargs=policy_kwargs, seed=0)
     th.nn.init.zeros_(model.policy.action_net.weight)
     for _ in range(3):
         model.policy.reset_noise(8)
-        utility = CandidateUtility(model, 2000, seed=0)
-        assert abs(float(utility(utility.theta[None]))) < 4.5 / 2000**0.5
+        utility = CandidateUtility(model, 1000, seed=0)
+        assert abs(float(utility(utility.theta[None]))) < 4.5 / 1000**0.5
 
 
 def test_a_measurement_before_a_rollout_leaves_the_noise_of_gsde():
