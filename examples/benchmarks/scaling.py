@@ -2,8 +2,7 @@
 How does throughput grow with the number of environments, and how far is it from the environments alone?
 
 CartPole-v1 with 1 to 256 copies: REINFORCE and A2C on a DummyVecEnv, REINFORCE on Gymnasium's native vectorization
-through ``GymnasiumVecEnv``, and the ``step`` of both VecEnvs with no learner. Writes a CSV, and with matplotlib the
-picture.
+through ``GymnasiumVecEnv``, and the ``step`` of both VecEnvs with no learner. Writes a CSV and the picture.
 
     python examples/benchmarks/scaling.py --output examples/benchmarks/results/scaling
 """
@@ -16,13 +15,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
+import matplotlib
 import torch as th
+from matplotlib import pyplot as plt
 from rates import ONE_PASS, bare, learning
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_reinforce import REINFORCE, GymnasiumVecEnv
+from sb3_reinforce.diagnostics.plots import COLORS
 
 
 def dummy(n_envs: int) -> VecEnv:
@@ -51,13 +53,7 @@ CONTENDERS: dict[str, Callable[[int, int], float]] = {
 
 
 def draw(rows: list[dict[str, object]], n_rounds: int, path: Path) -> None:
-    import matplotlib
-
     matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    from sb3_reinforce.diagnostics.plots import COLORS
-
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
     colors = (COLORS[0], COLORS[1], COLORS[0], COLORS[1], COLORS[2])
     for name, style, color in zip(CONTENDERS, (":", ":", "-o", "-o", "-s"), colors, strict=True):
@@ -98,10 +94,7 @@ def main() -> None:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
-    try:
-        draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))
-    except ImportError:
-        print("No picture: matplotlib is not installed (pip install 'sb3-reinforce[plots]')")
+    draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))
 
 
 if __name__ == "__main__":
