@@ -73,13 +73,12 @@ def test_resamples_have_m_samples_of_which_two_differ():
     assert not th.equal(resample_counts(9, 5, seed=0), resample_counts(9, 5, seed=1))
 
 
-@pytest.mark.parametrize("m", [32, 64])
-def test_95_percent_intervals_cover_the_truth_in_90_to_98_percent_of_500_repetitions(m):
+def test_95_percent_intervals_of_32_samples_cover_the_truth_in_90_to_98_percent_of_500_repetitions():
     generator, covered = th.Generator().manual_seed(0), th.zeros(4)
     reference = th.ones(8, dtype=th.float64) + MEAN
     truth = [TRACE, SIGNAL / TRACE, TRACE / SIGNAL, float(MEAN @ reference / MEAN.norm() / reference.norm())]
     for seed in range(500):
-        gradients = draw(m, generator)
+        gradients = draw(32, generator)
         found = gradient_statistics(gradients, reference, n_resamples=400, seed=seed)
         th.testing.assert_close(found.mean, gradients.mean(0))
         estimates = [found.variance, found.snr, found.noise_scale, found.cosine]
