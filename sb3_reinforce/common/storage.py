@@ -127,25 +127,17 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
     groups = state.get("param_groups", [])
     if [len(group.get("params", ())) for group in groups] != [len(group["params"]) for group in own["param_groups"]]:
         return "it has other groups of parameters"
-    for setting, value in own["param_groups"][0].items():
-        for group in groups:
-            if setting not in {*group, *FLAGS}:
-                return f"it has no {setting}: it belongs to another optimizer"
-            given = group.get(setting, value)
-            if isinstance(value, (float, tuple)) and type(given) not in (type(value), list, int):
-                return f"its {setting} is {given!r}"
-    parameters = dict(enumerate(parameter for group in optimizer.param_groups for parameter in group["params"]))
-    for index, moments in state.get("state", {}).items():
-        if index not in parameters:
-            return f"it has a parameter {index!r} more"
-        shapes = {key: np.shape(value) for key, value in own["state"].get(index, {}).items()}
-        if not shapes and "fused" in optimizer.defaults:
-            # A fused step goes through moments and parameter side by side, and would write beyond shorter moments
-            shapes = dict.fromkeys(moments, tuple(parameters[index].shape))
-        for key, shape in shapes.items():
-            if key not in moments or np.shape(moments[key]) not in ((), shape):
-                got = tuple(np.shape(moments.get(key)))
-                return f"its {key} of parameter {index} must have shape {shape}, got {got}"
+    for setting in own["param_groups"][0]:
+        if any(setting not in {*group, *FLAGS} for group in groups):
+            return f"it has no {setting}: it belongs to another optimizer"
+    if "fused" in optimizer.defaults:
+        # A fused step goes through moments and parameter side by side, and would write beyond shorter moments
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        for index, moments in state.get("state", {}).items():
+            for key, moment in moments.items():
+                shape, needed = tuple(np.shape(moment)), tuple(parameters[index].shape)
+                if shape not in ((), needed):
+                    return f"its {key} of parameter {index} must have shape {needed}, got {shape}"
     return ""
 
 
@@ -163,20 +155,15 @@ def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: boo
 
 
 def load_part(part: th.nn.Module | th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
-    """Load the state of an optimizer, or of a network that a subclass saves."""
-    if isinstance(part, th.optim.Optimizer):
-        load_optimizer(part, name, state, exact_match)
-    else:
+    """Load a network of a subclass, or an optimizer; a state of another kind is left out, or an error if exact."""
+    if not isinstance(part, th.optim.Optimizer):
         part.load_state_dict(state, strict=exact_match)
-
-
-def load_optimizer(optimizer: th.optim.Optimizer, name: str, state: Any, exact_match: bool) -> None:
-    """Load the state of an optimizer; one of another kind is left out, or with ``exact_match`` an error."""
-    reason = optimizer_mismatch(optimizer, state)
-    needed = f"load_path_or_dict[{name!r}] must be the state of {type(optimizer).__name__} for this policy"
+        return
+    reason = optimizer_mismatch(part, state)
+    needed = f"load_path_or_dict[{name!r}] must be the state of {type(part).__name__} for this policy"
     if not reason:
         # Copies, or two models that one dict is given to would share their moments
-        optimizer.load_state_dict(deepcopy(dict(state)))
+        part.load_state_dict(deepcopy(dict(state)))
     elif exact_match:
         raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
     else:

@@ -2,7 +2,6 @@
 
 import warnings
 from contextlib import nullcontext
-from itertools import product
 
 import pytest
 import torch as th
@@ -34,11 +33,6 @@ def not_finite(state):
     return {key: value * NAN for key, value in state.items()}
 
 
-def further_moments(states):
-    moments = states["policy.optimizer"]["state"]
-    return optimizer_with(states, state={**moments, 99: next(iter(moments.values()))})
-
-
 WRONG = {
     "nothing": lambda p: {},
     "an unknown name": lambda p: {**p, "foo": {}},
@@ -52,19 +46,15 @@ WRONG = {
     "not finite": lambda p: {**p, "policy": not_finite(p["policy"])},
     "no finite optimizer": lambda p: moments_with(p, not_finite),
     "no finite learning rate": lambda p: groups_with(p, lr=float("inf")),
-    "another optimizer's setting": lambda p: groups_with(p, betas="x"),
     "another optimizer's groups": lambda p: optimizer_with(p, param_groups=[{"params": [0]}] * 2),
     "another optimizer's moments": lambda p: moments_with(p, lambda moments: {**moments, "exp_avg": th.zeros(3, 77)}),
-    "another optimizer's further moments": further_moments,
-    "another optimizer's missing moments": lambda p: moments_with(p, lambda moments: {"step": moments["step"]}),
 }
 
 
-@both
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("exact_match", [True, False])
-def test_wrong_parameters_change_nothing_at_all(exact_match, wrong, kind):
-    model, other = make(kind, Corridor()).learn(32), make(kind, Corridor(), seed=1).learn(64)
+def test_wrong_parameters_change_nothing_at_all(exact_match, wrong):
+    model, other = (make("steps", Corridor(), seed=seed).learn(32) for seed in (0, 1))
     before = plain(model.get_parameters())
     states = WRONG[wrong](other.get_parameters())
     is_partial = wrong in ("no optimizer", "a key less", "a key more")
@@ -108,13 +98,7 @@ def test_the_states_of_other_optimizers_are_loaded(optimizer, kind, tmp_path):
 
 
 @both
-@pytest.mark.parametrize(
-    ("own", "other"),
-    [
-        *product((th.optim.SGD, th.optim.Adagrad), (th.optim.Adam, th.optim.RMSprop, th.optim.Adamax)),
-        *product((th.optim.Adam,), (th.optim.SGD, th.optim.Adagrad, th.optim.Adamax)),
-    ],
-)
+@pytest.mark.parametrize(("own", "other"), [(th.optim.SGD, th.optim.Adam), (th.optim.Adam, th.optim.SGD)])
 def test_the_state_of_another_kind_of_optimizer_is_left_out(own, other, kind):
     def make_with(optimizer):
         return make(kind, Corridor(), policy_kwargs={"net_arch": [4], "optimizer_class": optimizer})
