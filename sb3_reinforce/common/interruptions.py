@@ -41,20 +41,17 @@ uninterrupted = Uninterrupted()
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Raise ``KeyboardInterrupt`` on SIGTERM too, unless the user handles it; neither it nor Ctrl-C cuts an update."""
-    replaced: dict[int, tuple[Any, Any]] = {}
+    replaced: dict[int, Any] = {}
     in_main_thread = threading.current_thread() is threading.main_thread()
     for number in (signal.SIGINT, signal.SIGTERM):
         before = signal.getsignal(number)
         is_default_end = number == signal.SIGTERM and before is signal.SIG_DFL
         handler = signal.default_int_handler if is_default_end else before
         if in_main_thread and callable(handler):
-            during = partial(uninterrupted.handle_signal, handler)
-            replaced[number] = before, during
-            signal.signal(number, during)
+            replaced[number] = before
+            signal.signal(number, partial(uninterrupted.handle_signal, handler))
     try:
         yield
     finally:
-        for changed, (before, during) in replaced.items():
-            # A callback may have set its own handler, for good
-            if signal.getsignal(changed) is during:
-                signal.signal(changed, before)
+        for changed, before in replaced.items():
+            signal.signal(changed, before)

@@ -164,14 +164,6 @@ def test_sigterm_is_left_to_a_user_who_handles_it():
     assert seen == [signal.SIGTERM]
 
 
-def test_a_handler_that_a_callback_sets_stays():
-    def own(number, frame):
-        raise SystemExit
-
-    make("steps", Corridor()).learn(64, At(3, lambda model: signal.signal(signal.SIGTERM, own)))
-    assert signal.getsignal(signal.SIGTERM) is own
-
-
 def test_training_in_another_thread_sets_no_handlers():
     model = make("steps", Corridor())
     thread = threading.Thread(target=model.learn, args=(64,))
