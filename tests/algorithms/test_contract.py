@@ -224,8 +224,9 @@ def test_the_policy_can_be_pickled_and_copied():
         assert all(map(th.equal, policy.parameters(), other.parameters()))
 
 
-@pytest.mark.parametrize("callback", [PitfallCallback, partial(GradientQualityCallback, 1)])
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize(
+    ("env", "callback"), [("CartPole-v1", PitfallCallback), ("Pendulum-v1", partial(GradientQualityCallback, 1))]
+)
 def test_the_policy_can_be_copied_where_a_callback_has_measured(env, callback):
     def can_be_copied(model):
         return all(map(th.equal, copy.deepcopy(model.policy).parameters(), model.policy.parameters()))

@@ -151,9 +151,8 @@ def test_candidates_sample_only_on_request(deterministic):
     assert (len(estimate.utilities.unique()) == 1) == deterministic
 
 
-@pytest.mark.parametrize("estimator", ["regression", "central", "forward"])
-def test_it_learns_the_line(estimator):
-    model = make(make_vec_env(Line, 8), estimator=estimator, n_delta=8, learning_rate=0.1).learn(3000)
+def test_it_learns_the_line():
+    model = make(make_vec_env(Line, 8), estimator="regression", n_delta=8, learning_rate=0.1).learn(3000)
     assert float(model.theta) == pytest.approx(3, abs=0.2)
 
 

@@ -1,7 +1,5 @@
 """It learns: a small version in a few seconds, and the README's claim on all its seeds."""
 
-import itertools
-
 import pytest
 from environments import native
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
@@ -12,13 +10,18 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_reinforce import REINFORCE
 
-ENVS = [IdentityEnv, IdentityEnvMultiDiscrete, IdentityEnvMultiBinary, IdentityEnvBox]
-CASES = [*itertools.product(ENVS, ["leave_one_out", "value"]), (IdentityEnv, "none"), (IdentityEnv, "time_mean")]
+# What the other pairs would have in common with these, test_gradient states exactly
+CASES = [
+    (IdentityEnv, "value"),
+    (IdentityEnvMultiDiscrete, "leave_one_out"),
+    (IdentityEnvMultiBinary, "value"),
+    (IdentityEnvBox, "leave_one_out"),
+]
 
 
 @pytest.mark.parametrize(("env_class", "baseline"), CASES)
 def test_to_repeat_the_observation(env_class, baseline):
-    """Nearly all of the 100 rewards of an episode, from each action space and with and without a critic."""
+    """Nearly all of the 100 rewards of an episode, from each action space, with a critic or without."""
     box = env_class is IdentityEnvBox
     env = make_vec_env(env_class, 8, env_kwargs={"eps": 0.5} if box else {"dim": 3})
     mode = {"n_steps": 8} if baseline == "value" else {"n_episodes": 8}
