@@ -170,7 +170,6 @@ class FiniteDifference(BasePolicyGradient):
         self.deterministic = deterministic
         self.max_grad_norm = max_grad_norm
         self.max_episode_steps = max_episode_steps
-        self.is_collecting = False
         self._generator: th.Generator | None = None
         if _init_setup_model:
             self._setup_model()
@@ -360,9 +359,6 @@ class FiniteDifference(BasePolicyGradient):
             self.logger.record("train/standard_error", float(fit.standard_error.mean()))
         self.logger.record("rollout/utility_mean", float(utilities.mean()))
         self.logger.record("rollout/utility_std", utility_std)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "is_collecting"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

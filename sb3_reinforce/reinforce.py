@@ -232,8 +232,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         self.target_kl = target_kl
         #: The last rollout; None before the first one, while one is collected, and after an interrupted one
         self.rollout: Rollout | None = None
-        #: Whether a rollout is being collected, so that its environments must be left alone
-        self.is_collecting = False
         self._state: th.Tensor | None = None
         self._running = Running.none(1)
         if _init_setup_model:
@@ -570,7 +568,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_groups", "rollout", "is_collecting"]
+        return [*super()._excluded_save_params(), "_groups", "rollout"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "critic_optimizer"], []

@@ -57,6 +57,8 @@ class BasePolicyGradient(Distributed):
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
         self._chosen_defaults: dict[str, int] = {}
+        #: Whether episodes are being played, so that the environments must be left alone
+        self.is_collecting = False
         super().__init__(env=env, **kwargs)
 
     def _check_policy(self, policy: str | type) -> None:
@@ -98,7 +100,7 @@ class BasePolicyGradient(Distributed):
         super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_schedules"]
+        return [*super()._excluded_save_params(), "_schedules", "is_collecting"]
 
     def predict(
         self,
