@@ -165,7 +165,7 @@ class BasePolicyGradient(Distributed):
             ``lr_schedule`` that was set by hand is not stored
         :return: The model
         :raises TypeError: If an argument is of the wrong type, or the algorithm has none of this name
-        :raises ValueError: If an argument is out of its range, or the file is damaged or has no random state
+        :raises ValueError: If an argument is out of its range, or the file is damaged
         """
         check_device("device", device)
         check_flag("restore_random_state", restore_random_state)
@@ -181,8 +181,6 @@ class BasePolicyGradient(Distributed):
             raise TypeError(
                 f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {', '.join(sorted(arguments))}"
             )
-        if restore_random_state and "_random_state" not in saved:
-            raise ValueError(f"restore_random_state must be False for {path}, which was saved without a random state")
         if env is not None:
             env = check_env(env, verbose=0)
         n_envs = None if env is None else getattr(env, "num_envs", 1)
