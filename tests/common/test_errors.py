@@ -38,13 +38,10 @@ def test_an_episode_longer_than_max_episode_steps_is_an_error():
     assert model.learn(35)._n_updates == 1
 
 
-@pytest.mark.parametrize("reward", [1.0, 1e-41])
-@pytest.mark.parametrize(
-    "kwargs", [{"n_steps": 128}, {"n_steps": 400}, {"n_episodes": 2}, {"n_episodes": 2, "reward_to_go": False}]
-)
-def test_numbers_may_underflow_where_numpy_raises_errors(kwargs, reward):
+@pytest.mark.parametrize("kwargs", [{"n_steps": 128}, {"n_episodes": 2, "reward_to_go": False}])
+def test_numbers_may_underflow_where_numpy_raises_errors(kwargs):
     """γ^t and returns in float32, where a user looks for the source of a NaN by ``np.seterr(all="raise")``."""
-    env = VecNormalize(make_vec_env(lambda: Corridor((200,), lambda t, action: reward)))
+    env = VecNormalize(make_vec_env(lambda: Corridor((200,), lambda t, action: 1e-41)))
     kind = "episodes" if "n_episodes" in kwargs else "steps"
     with np.errstate(all="raise"):
         model = make(kind, env, gamma=1e-3, discount_scores=True, **kwargs).learn(256)
