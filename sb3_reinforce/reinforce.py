@@ -293,7 +293,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         Collect a rollout with the current policy and compute the weights of its steps.
 
-        :param env: The training environment
+        :param env: The model's environments
         :param callback: Called at each step, and at the beginning and end of the rollout
         :param rollout_buffer: Filled as by A2C: ``advantages`` is G_t − b_t, and ``returns`` what the critic is fitted
             to, or without a critic G_t; both are 0 at steps that are not used. ``rewards`` do not include γ V at time
@@ -311,11 +311,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.n_envs = env.num_envs
         rollout_buffer.reset()
         n_steps = self.n_steps
-        model_env = self.env
         callback.on_rollout_start()
-        if self.env is not model_env:
-            env = model_env = cast(VecEnv, self.env)
-        # The user or a callback may have changed arguments
+        # The user or a callback may have changed the environments and arguments
+        env = cast(VecEnv, self.env)
         check_reinforce(self)
         check_starts(self)
         self._apply_temperature_and_floor()
@@ -356,7 +354,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             raise
         finally:
             self.is_collecting = False
-            if not is_collected or self.env is not model_env or has_given_seeds(env):
+            if not is_collected or self.env is not env or has_given_seeds(env):
                 # The environments stopped in the middle of episodes, are others than in this rollout, or may draw the
                 # same random numbers: they are reset before they are used
                 self._last_obs = None
