@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At
 from models import both, make
 
 
@@ -39,10 +38,3 @@ def test_a_schedule_is_called_once_where_its_value_is_needed_once():
     assert len(seen) - n_before == model._n_updates == 10
     # At construction it is checked at both ends
     assert set(seen[:n_before]) == {0.0, 1.0}
-
-
-@both
-def test_a_callback_may_replace_a_schedule(kind):
-    name = "ent_coef" if kind == "steps" else "delta_std"
-    with pytest.raises(TypeError, match=f"{name} must be a number or a schedule"):
-        make(kind, **{name: 0.1}).learn(1000, At(1, lambda model: setattr(model, name, "x")))
