@@ -106,14 +106,12 @@ class RecurrentREINFORCE(REINFORCE):
         check_sequence_methods(policy, {name for cls in classes for name in vars(cls)})
 
     def _setup_model(self) -> None:
-        has_dicts = isinstance(self.observation_space, spaces.Dict)
-        if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy):
-            fitting = MultiInputLstmPolicy if has_dicts else MlpLstmPolicy
-            if self.policy_class is not fitting:
-                raise ValueError(
-                    f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
-                    f"{self.policy_class.__name__}"
-                )
+        fitting = MultiInputLstmPolicy if isinstance(self.observation_space, spaces.Dict) else MlpLstmPolicy
+        if self.policy_class in {MlpLstmPolicy, MultiInputLstmPolicy} - {fitting}:
+            raise ValueError(
+                f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
+                f"{self.policy_class.__name__}"
+            )
         super()._setup_model()
 
     def _excluded_save_params(self) -> list[str]:
