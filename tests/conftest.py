@@ -1,6 +1,7 @@
 """One torch thread per test process, as tests run in parallel; the same random numbers and signals in every run."""
 
 import itertools
+import multiprocessing
 import signal
 
 import pytest
@@ -9,6 +10,8 @@ from gymnasium.utils import seeding
 from stable_baselines3.common.utils import set_random_seed
 
 th.set_num_threads(1)
+# The server of forks imports PyTorch once, and not each worker of a SubprocVecEnv
+multiprocessing.set_forkserver_preload(["sb3_reinforce", "stable_baselines3.common.env_util"])
 
 
 @pytest.fixture(autouse=True)
