@@ -25,11 +25,12 @@ ARGUMENTS = ("gamma", "gae_lambda", "reward_to_go", "discount_scores", "normaliz
 LOGITS = th.tensor([[0.3, -0.4], [-0.7, 0.2], [0.5, 0.1]], dtype=th.float64)
 
 
-def make_model(ragged=False, **kwargs):
+def make_model(ragged=False, env=None, **kwargs):
     arguments = {"gamma": GAMMA, "n_episodes": 2, "normalize_by": "episodes", "discount_scores": True, **kwargs}
     policy_kwargs = {"net_arch": [], "features_extractor_class": Double}
     with float64():
-        model = REINFORCE("MlpPolicy", Tree(ragged), policy_kwargs=policy_kwargs, device="cpu", **arguments)
+        env = env or Tree(ragged)
+        model = REINFORCE("MlpPolicy", env, policy_kwargs=policy_kwargs, device="cpu", **arguments)
     with th.no_grad():
         model.policy.action_net.weight.copy_(LOGITS.T)
         model.policy.action_net.bias.zero_()

@@ -23,16 +23,16 @@ from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normal
 from sb3_reinforce.diagnostics.tables import Estimate, Table
 
 
-def bandit(algorithm=REINFORCE, **kwargs):
+def bandit(algorithm=REINFORCE, n_envs=8, **kwargs):
     """Action 1 is worth 1, action 0 nothing: U = π(1), whatever the observation."""
-    env = make_vec_env(lambda: Corridor((1,), lambda t, action: float(action)), 8, seed=0)
+    env = make_vec_env(lambda: Corridor((1,), lambda t, action: float(action)), n_envs, seed=0)
     return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0, **kwargs)
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.2])
 def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(temperature):
-    model = bandit(temperature=temperature)
-    utility = CandidateUtility(model, 400, seed=0)
+    model = bandit(n_envs=40, temperature=temperature)
+    utility = CandidateUtility(model, 1000, seed=0)
     thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0 * temperature])
     with th.no_grad():
         expected = float(model.policy.get_distribution(th.ones(1, 1)).distribution.logits.diff())
@@ -44,12 +44,12 @@ def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(temperatu
 
 def test_the_likelihood_ratio_is_the_gradient_of_the_tree():
     """Asked of a model with γ = ½, which is set aside."""
-    gradients, n_steps = likelihood_ratio(make_model(), 1000)
+    gradients, n_steps = likelihood_ratio(make_model(env=DummyVecEnv([Tree] * 40)), 2000)
     truth = true_gradient(Tree().trajectories(), lambda episode: sum(reward for _, _, reward in episode))
-    assert gradients.shape == (1000, 6)
-    assert n_steps == 2000
+    assert gradients.shape == (2000, 6)
+    assert n_steps == 4000
     error = gradients.mean(0) - truth.T.flatten()
-    assert (error.abs() <= 4.5 * gradients.std(0) / 1000**0.5).all()
+    assert (error.abs() <= 4.5 * gradients.std(0) / 2000**0.5).all()
 
 
 def test_the_likelihood_ratio_has_the_mean_of_the_others_as_baseline():
