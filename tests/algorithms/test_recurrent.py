@@ -148,7 +148,7 @@ def test_outputs_are_those_of_one_step_at_a_time(n_steps, truncate, name):
     model = make_recurrent(name, env, n_steps=n_steps, n_episodes=None if n_steps else 4, learning_rate=0.0)
     records = Record(lambda model: (model.rollout, model._last_obs, copy_of(model.rollout_buffer)))
     ends = Ends()
-    model.learn(60, [records, ends, switch])
+    model.learn(36, [records, ends, switch])
     first = 0
     running = [[], []]
     for rollout, last_obs, (starts, log_probs) in records.records:

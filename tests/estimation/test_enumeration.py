@@ -23,11 +23,16 @@ from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.baselines import score_products
 
 
-@pytest.mark.parametrize("ragged", [False, True])
-@pytest.mark.parametrize("reward_to_go", [False, True])
+# The full tree has 256 batches of four, the ragged one 81
 @pytest.mark.parametrize(
-    ("baseline", "n_episodes"), [("none", 2), ("leave_one_out", 2), ("optimal", 3), ("optimal", 4)]
+    ("baseline", "n_episodes", "ragged"),
+    [
+        *product(["none", "leave_one_out"], [2], [False, True]),
+        *product(["optimal"], [3], [False, True]),
+        ("optimal", 4, True),
+    ],
 )
+@pytest.mark.parametrize("reward_to_go", [False, True])
 def test_none_leave_one_out_and_optimal_are_unbiased(baseline, n_episodes, reward_to_go, ragged):
     model = make_model(ragged, baseline=baseline, reward_to_go=reward_to_go, n_episodes=n_episodes)
     assert_equal(expected_gradient(model, n_episodes), gradient_of_return(model))
