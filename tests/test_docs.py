@@ -26,6 +26,8 @@ SMALL = {
     r"n_eval_episodes=\d+": "n_eval_episodes=2",
     r"n_episodes=100": "n_episodes=10",
     r"n_estimates=\d+": "n_estimates=3",
+    # A rollout of PPO has 2048 steps of each environment
+    r'"CartPole-v1", n_envs=8': '"CartPole-v1", n_envs=2',
 }
 # What CI appends to a command, by the script or the command of the Zoo, so that it takes seconds
 BUDGETS = {
