@@ -20,13 +20,15 @@ from sb3_reinforce.zoo import HYPERPARAMS, experiments
 
 sys.path.append(str(Path(__file__).parents[2] / "examples" / "benchmarks"))
 import compare
-import compare_plots
 
 BENCHMARKS = Path(compare.__file__).parent
 
 
 @pytest.fixture
 def plots(monkeypatch):
+    # It imports rliable, which takes seconds, in the processes that have these tests alone
+    import compare_plots
+
     monkeypatch.setattr(compare_plots, "REPETITIONS", 20)
     return compare_plots
 
