@@ -41,7 +41,8 @@ def test_equal_returns_pass(baseline):
     """Their mean differs from each by rounding."""
     env = make_vec_env(lambda: Corridor((5,)), 2, seed=0)
     model = REINFORCE("MlpPolicy", env, baseline=baseline, gamma=0.99, reward_to_go=baseline != "mean", device="cpu")
-    assert all(check_gradient(model, n_episodes=n).passed for n in (3, 7))
+    # With both numbers each of the three baselines rounds
+    assert all(check_gradient(model, n_episodes=n).passed for n in (3, 6))
 
 
 def two_episodes(env, policy="MlpPolicy", **kwargs):
