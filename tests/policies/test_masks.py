@@ -35,6 +35,7 @@ def takes_only_allowed_actions(algorithm, task, n_steps, **kwargs):
     return sum(env.get_attr("n_steps"))
 
 
+SMALL = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 16}}
 NETWORKS = [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared_lstm": True}]
 
 
@@ -42,7 +43,8 @@ NETWORKS = [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared
     ("algorithm", "task", "kwargs"),
     [
         *product(ALGORITHMS, ["discrete", "multidiscrete"], [{}]),
-        *product(["reinforce", "search", "recurrent"], ["image", "numbers"], [{}]),
+        *product(["reinforce", "search", "recurrent"], ["numbers"], [{}]),
+        *product(["reinforce", "search", "recurrent"], ["image"], [{"policy_kwargs": SMALL}]),
         *(("recurrent", "discrete", {"policy_kwargs": network}) for network in NETWORKS),
         *(("reinforce", "multidiscrete", {"temperature": temperature}) for temperature in (1e-3, 0.5, 1e6)),
     ],
