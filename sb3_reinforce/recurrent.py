@@ -107,7 +107,7 @@ class RecurrentREINFORCE(REINFORCE):
 
     def _setup_model(self) -> None:
         fitting = MultiInputLstmPolicy if isinstance(self.observation_space, spaces.Dict) else MlpLstmPolicy
-        if self.policy_class in {MlpLstmPolicy, MultiInputLstmPolicy} - {fitting}:
+        if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy) and self.policy_class is not fitting:
             raise ValueError(
                 f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
                 f"{self.policy_class.__name__}"
@@ -123,7 +123,7 @@ class RecurrentREINFORCE(REINFORCE):
         """
         Collect a rollout as :class:`~sb3_reinforce.REINFORCE` does, and keep the states that the next one goes on from.
 
-        :param env: The training environment
+        :param env: The model's environments
         :param callback: Called at each step, and at the beginning and end of the rollout
         :param rollout_buffer: Filled as by A2C
         :param n_rollout_steps: Steps per environment, None for whole episodes

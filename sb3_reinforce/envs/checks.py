@@ -64,7 +64,10 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
         for key, part in space.spaces.items():
             check_observation(part, obs[key], env)
         return
-    values = np.asarray(obs)
+    try:
+        values = np.asarray(obs)
+    except ValueError as error:
+        raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
     fits = values.shape == space.shape and values.dtype.kind in "biuf"
     if fits and values.dtype.kind == "f" and np.dtype(space.dtype).kind != "f":
         # Integers may stand for real numbers, and whole numbers for integers, but not fractions

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import torch as th
 from torch import nn
 
-from sb3_reinforce.common.arguments import check_choice
+from sb3_reinforce.common.arguments import check_choice, check_integer
 
 State: TypeAlias = tuple[th.Tensor, th.Tensor]
 
@@ -29,9 +29,11 @@ class RNN(AsLstm, nn.RNN):  # type: ignore[misc]
 MEMORIES: dict[str, Any] = {"lstm": nn.LSTM, "gru": GRU, "rnn": RNN}
 
 
-def check_memory(memory: Any, lstm_kwargs: Any) -> None:
+def check_memory(memory: Any, lstm_kwargs: Any, **kwargs: Any) -> None:
     """Check the arguments of a recurrent policy that sb3-contrib does not know or check."""
     check_choice("memory", memory, tuple(MEMORIES))
+    for name in ("lstm_hidden_size", "n_lstm_layers"):
+        check_integer(name, kwargs.get(name, 1), 1)
     allowed = {"bias", "dropout"} | ({"nonlinearity"} if memory == "rnn" else set())
     if lstm_kwargs is not None and not (isinstance(lstm_kwargs, dict) and lstm_kwargs.keys() <= allowed):
         raise ValueError(f"lstm_kwargs must be a dict with some of {', '.join(sorted(allowed))}, got {lstm_kwargs!r}")

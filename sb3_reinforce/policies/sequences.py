@@ -43,7 +43,7 @@ class RecurrentPolicy(ActorCriticPolicy):
     lstm_hidden_state_shape: tuple[int, int, int]
 
     def __init__(self, *args: Any, memory: str = "lstm", lstm_kwargs: dict[str, Any] | None = None, **kwargs: Any):
-        check_memory(memory, lstm_kwargs)
+        check_memory(memory, lstm_kwargs, **kwargs)
         super().__init__(*args, **kwargs)
         self.memory_arguments = {name: kwargs[name] for name in LSTM_ARGUMENTS if name in kwargs}
         self.memory_arguments |= {"memory": memory, "lstm_kwargs": lstm_kwargs}

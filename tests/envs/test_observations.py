@@ -21,6 +21,7 @@ MALFORMED = {
     "a dict": {"x": 1},
     "complex": np.ones(7) * 1j,
     "objects": np.array([None] * 7),
+    "ragged": [[0.0], [0.0, 1.0]],
 }
 # Where the second environment returns it, and in which step of all of them
 WHEN = {

@@ -120,9 +120,10 @@ def test_every_transition_of_the_native_cart_pole_is_that_of_the_single_one():
 
 def test_options_must_be_the_same_for_all_copies():
     env = synced(Corridor)
-    env.set_options({"level": np.array(["first"]), "scale": np.nan})
-    env.reset()
-    env.set_options([{"level": i} for i in range(N_ENVS)])
+    for options in ({"level": np.array(["first"]), "scale": np.nan}, [{"level": np.zeros(2)} for _ in range(N_ENVS)]):
+        env.set_options(options)
+        env.reset()
+    env.set_options([{"level": np.full(2, 10**6 + i)} for i in range(N_ENVS)])
     with pytest.raises(ValueError, match="set_options"):
         env.reset()
 
