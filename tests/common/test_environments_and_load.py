@@ -173,6 +173,8 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
     changed.baseline = "time_mean"
     changed.save(tmp_path / "model")
     assert loaded(2).n_steps == 32
+    make("episodes", make_vec_env("CartPole-v1", 2), n_episodes=None).save(tmp_path / "model")
+    assert (loaded(2).n_episodes, loaded(20).n_episodes) == (16, 20)
     make("steps", n_steps=32).save(tmp_path / "model")
     with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both given"):
         loaded(1, n_episodes=4)
