@@ -256,7 +256,7 @@ class Numbers(SyncVectorEnv):
 
     def step(self, actions):
         obs, rewards, terminated, truncated, infos = super().step(actions)
-        return obs, rewards, terminated.astype(int), truncated.astype(int), infos
+        return obs, rewards, terminated.astype(int).tolist(), truncated.astype(int), infos
 
     def reset(self, *, seed=None, options=None):
         if options is not None:
