@@ -58,7 +58,7 @@ TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
             "must have no memory, got RecurrentActorCriticPolicy",
         ),
         (memory(memory="LSTM"), "memory must be one of 'lstm', 'gru', 'rnn'"),
-        (memory(lstm_hidden_size=8.0), "lstm_hidden_size must be"),
+        (memory(lstm_hidden_size=0), "lstm_hidden_size must be"),
         (memory(lstm_kwargs={"batch_first": True}), "lstm_kwargs must be a dict with some of bias, dropout"),
         (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
         (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
