@@ -178,6 +178,7 @@ def test_without_the_zoo_its_models_load_and_its_bridge_says_what_to_install(tmp
 
 
 REINFORCE = ["train", "--algo", "reinforce"]
+PENDULUM = [*REINFORCE, "--env", "Pendulum-v1", "--conf-file", "default.yml"]
 ENTRY = "policy: MlpPolicy, n_timesteps: 100"
 CONFIGURATIONS = [
     ("[1, 2]", "wrong.yml must be a dict, got [1, 2]"),
@@ -292,13 +293,14 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([*REINFORCE, "--conf-file", "broken.py"], "broken.py cannot be read: '{' was never closed"),
         # A temperature in the default entry is left out, but not one that was asked for
-        ([*REINFORCE, "--env", "Pendulum-v1", "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
+        ([*PENDULUM, "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
     ],
 )
 def test_a_wrong_command_is_answered_with_a_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("broken.py").write_text("hyperparams = {")
+    Path("default.yml").write_text("default: {policy: MlpPolicy, n_timesteps: 100, temperature: 0.3}")
     assert sentence in message_of(capsys, *arguments)
 
 
