@@ -54,7 +54,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any]):
         super().__init__(env)
         sizes = sizes_of(env.action_space)
-        if not env.has_wrapper_attr("action_masks"):
+        if not (env.has_wrapper_attr("action_masks") and callable(env.get_wrapper_attr("action_masks"))):
             raise TypeError(f"env must have a method action_masks() that says which actions are allowed, got {env}")
         space = env.observation_space
         self._has_dicts = isinstance(space, spaces.Dict)
@@ -80,7 +80,11 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     def _allowed(self, is_over: bool) -> NDArray[np.bool_]:
         """The mask of the present state."""
         masks = self.env.get_wrapper_attr("action_masks")()
-        numbers = np.ravel(masks)
+        try:
+            numbers = np.ravel(masks)
+        except ValueError:
+            # Lists of different lengths
+            numbers = np.empty(0)
         # A mask that is added to logits (0 = allowed) would be read the other way round
         if len(numbers) != self._n_actions or not np.isin(numbers, (0, 1)).all():
             raise ValueError(

@@ -1,5 +1,6 @@
 """Observations and rewards of another form are named, unless they stand for the right ones."""
 
+from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -115,7 +116,9 @@ def test_errors_of_an_environment_below_monitor_are_its_own(kind):
 
 
 @both
-@pytest.mark.parametrize("value", [np.float64(2), np.int64(2), np.array(2.0), th.tensor(2.0), True, 2], ids=repr)
+@pytest.mark.parametrize(
+    "value", [np.float64(2), np.int64(2), np.array(2.0), th.tensor(2.0), True, 2, Fraction(3, 2)], ids=repr
+)
 def test_other_forms_of_a_reward_are_accepted(value, kind):
     model = make(kind, Corridor((3,), reward=lambda t, action: value)).learn(32)
     assert model.ep_info_buffer[0]["r"] == 3 * float(value)

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE, ActionMaskObservation, GymnasiumVecEnv, MaskedPolicy
 from sb3_reinforce.diagnostics import PitfallCallback, check_gradient, compare_baselines, compare_estimators
@@ -77,6 +77,14 @@ def test_masks_reach_the_policy_through_every_vec_env(vec_env, algorithm):
     env, eval_env = VEC_ENVS[vec_env](), VEC_ENVS[vec_env]()
     model = make(algorithm, env).learn(150, EvalCallback(eval_env, eval_freq=50, n_eval_episodes=2, warn=False))
     assert model.num_timesteps >= 150
+
+
+def test_masks_are_made_in_the_workers():
+    env = two_environments(vec_env_cls=SubprocVecEnv)
+    rollout = make("reinforce", env).learn(150).rollout
+    env.close()
+    masks = rollout.observations["action_mask"]
+    assert not masks.all() and masks.gather(2, rollout.actions.long()).all()
 
 
 def test_a_mask_is_not_normalized():
@@ -144,6 +152,10 @@ def test_only_discrete_actions_can_be_masked(space, algorithm):
 def test_an_environment_needs_action_masks():
     with pytest.raises(TypeError, match=r"env must have a method action_masks\(\) .*got <Random"):
         ActionMaskObservation(Random(VECTOR))
+    attribute = Masked(VECTOR)
+    attribute.action_masks = np.ones(2, dtype=bool)
+    with pytest.raises(TypeError, match=r"env must have a method action_masks\(\)"):
+        ActionMaskObservation(attribute)
     with pytest.raises(ValueError, match="must not have the key 'action_mask' yet"):
         ActionMaskObservation(environment())
 
@@ -197,7 +209,7 @@ def test_a_masked_policy_needs_masks_and_observations(space, algorithm):
         ("discrete", [0.0, -np.inf, 0.0, 0.0, 0.0], "must return 5 booleans"),
         ("discrete", [1, 2, 0, 0, 0], "must return 5 booleans"),
         ("discrete", [False] * 5, "must allow an action of Discrete(5) until the episode is over, got [False, "),
-        ("multidiscrete", [True] * 5, "must return 9 booleans in a row for MultiDiscrete"),
+        ("multidiscrete", [[True] * 2, [True] * 4, [True] * 3], "must return 9 booleans in a row for MultiDiscrete"),
         ("multidiscrete", [True] * 6 + [False] * 3, "must allow an action in each dimension of MultiDiscrete"),
     ],
 )
