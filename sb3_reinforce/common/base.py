@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 from sb3_reinforce.common import storage
 from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device, check_flag, own_arguments
 from sb3_reinforce.common.distribution import Distributed
-from sb3_reinforce.common.processes import is_leader
+from sb3_reinforce.common.processes import is_leader, rank_and_size
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
 from sb3_reinforce.common.spaces import check_env, check_noise, shift_to_start
 
@@ -133,6 +133,7 @@ class BasePolicyGradient(Distributed):
         :raises OSError: If the file cannot be written
         """
         self._random_state = storage.generator_states(self.device)
+        self._n_processes = rank_and_size()[1]
         buffer = BytesIO()
         super().save(buffer, exclude, include)
         storage.write_whole(path, buffer.getvalue())

@@ -18,7 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.save_util import open_path
 
-from sb3_reinforce.common.processes import is_leader
+from sb3_reinforce.common.processes import is_leader, rank_and_size
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 # The names in REINFORCE's parameters; FiniteDifference lacks the last
@@ -79,8 +79,9 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
 
 
 def left_open(saved: Mapping[str, Any], given: Set[str], n_envs: int | None) -> dict[str, None]:
-    """None for each default to choose again, if arguments are given or the number of environments differs."""
-    if not given and n_envs in (None, saved.get("n_envs")):
+    """None for each default to choose again, if arguments are given or the environments or processes differ."""
+    has_same_envs = n_envs in (None, saved.get("n_envs")) and rank_and_size()[1] == saved.get("_n_processes", 1)
+    if not given and has_same_envs:
         return {}
     chosen = saved.get("_chosen_defaults", {})
     return {name: None for name, value in chosen.items() if saved.get(name) == value and name not in given}

@@ -284,6 +284,17 @@ def test_candidates_of_all_processes_are_compared_on_one_scale(tmp_path):
     assert of_process_0 == 0
 
 
+def test_a_default_is_chosen_again_for_another_number_of_processes(tmp_path):
+    path = tmp_path / "model"
+    make("episodes", corridors(12), n_episodes=None).save(path)
+
+    def load(rank):
+        return KINDS["episodes"][0].load(path, device="cpu").n_episodes
+
+    assert load(0) == 16
+    assert in_processes(2, load, tmp_path) == [24, 24]
+
+
 @pytest.mark.parametrize(("seed", "expected"), [(5, 7), (2**31, 2**31 + 2), (2**32 - 1, 1)])
 def test_the_environments_of_the_second_process_have_the_following_seeds(seed, expected, monkeypatch):
     """NumPy takes seeds up to 2³² − 1."""
