@@ -38,7 +38,7 @@ agents:
 	python -m sb3_reinforce.zoo.model_card --algo reinforce --env $${task%:*} -f agents'
 
 wheel:
-	.ci/wheel
+	.ci/wheel $(WHEEL_OPTIONS)
 
 # The oldest versions that pyproject.toml allows; matplotlib 3.8 warns of what pyparsing has deprecated since
 test-lowest:

@@ -84,6 +84,8 @@ RUN = {
     ]
     for name, text in TEXTS.items()
 }
+# A benchmark takes seconds even so, and no user runs it
+SLOW = [name for name, found in RUN.items() if any("examples/benchmarks" in command for command in found)]
 WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo) \w|\.py\b.* --")
 
 
@@ -110,7 +112,10 @@ def last_values(words: list[str]) -> frozenset[tuple[str, ...]]:
     return frozenset(map(tuple, options.values()))
 
 
-@pytest.mark.parametrize("name", [name for name, found in RUN.items() if found])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name, found in RUN.items() if found],
+)
 @pytest.mark.filterwarnings("ignore")
 def test_commands_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, with small budgets, in this process, which has imported PyTorch already."""

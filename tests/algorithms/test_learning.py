@@ -12,9 +12,9 @@ from sb3_reinforce import REINFORCE
 
 # What the other pairs would have in common with these, test_gradient states exactly
 CASES = [
-    (IdentityEnv, "value"),
+    pytest.param(IdentityEnv, "value", marks=pytest.mark.slow),
     (IdentityEnvMultiDiscrete, "leave_one_out"),
-    (IdentityEnvMultiBinary, "value"),
+    pytest.param(IdentityEnvMultiBinary, "value", marks=pytest.mark.slow),
     (IdentityEnvBox, "leave_one_out"),
 ]
 

@@ -206,7 +206,7 @@ def test_a_callback_may_turn_common_random_numbers_off():
 
 MEASUREMENTS = {
     "landscape": partial(landscape, n_points=2, n_episodes=1),
-    "starts": partial(compare_starts, n_starts=8),
+    "starts": partial(compare_starts, n_starts=4),
     "estimators": partial(compare_estimators, n_episodes=4, n_estimates=3, estimators=("likelihood_ratio",)),
 }
 

@@ -186,6 +186,7 @@ def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):
         table.to_pandas()
 
 
+@pytest.mark.slow
 def test_episodes_with_new_noise_at_each_step_are_independent():
     """The mean of 20 episodes varies over repetitions as their own variance says, tr Σ / 20."""
     model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, sde_sample_freq=1, device="cpu", seed=0)

@@ -86,7 +86,9 @@ def test_95_percent_intervals_of_32_samples_cover_the_truth_in_90_to_98_percent_
     assert ((0.90 <= covered / 500) & (covered / 500 <= 0.98)).all(), covered / 500
 
 
-@pytest.mark.parametrize(("m", "scale"), [(10, 0.2), (10, 0.5), (20, 1.0)])
+@pytest.mark.parametrize(
+    ("m", "scale"), [(10, 0.2), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(10, 0.5), (20, 1.0)])]
+)
 def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same(m, scale):
     """Signal-to-noise ratios of the mean from 0.08 to 4; the reference is as noisy where it is made of samples too."""
     generator, covered, both = th.Generator().manual_seed(0), 0, 0

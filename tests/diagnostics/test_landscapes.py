@@ -110,6 +110,7 @@ def test_the_signal_to_noise_ratio_is_per_step(monkeypatch):
     assert row.steps > 1 and found == pytest.approx((6 / row.steps, 3 / row.steps, 9 / row.steps))
 
 
+@pytest.mark.slow
 def test_with_the_default_perturbations_every_estimator_sees_something_on_cartpole():
     env = make_vec_env("CartPole-v1", 8, seed=0)
     model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": {"pi": [], "vf": [64]}}, device="cpu", seed=0)

@@ -66,7 +66,7 @@ TASKS = [
     ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
     ("total_return", "reward_to_go=True", rewarded((4,)), 64, {**whole, "n_episodes": 4, "reward_to_go": False}),
     ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
-    ("useless_critic", "n_critic_updates", rewarded((4,), noise), 8000, flat_critic),
+    ("useless_critic", "n_critic_updates", rewarded((4,), noise), 4000, flat_critic),
     ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, one_action),
     ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, certain),
     ("deterministic_too_early", "min_std", rewarded((4,), action_space=BOX), 640, narrow),
@@ -169,7 +169,7 @@ def test_a_spike_does_not_lengthen_the_natural_step():
 
 
 def test_of_several_pitfalls_with_one_cause_the_cause_is_reported():
-    assert set(fall("CartPole-v1", 8000, learning_rate=1.0)) == {"rate_too_large"}
+    assert set(fall("CartPole-v1", 4000, learning_rate=1.0)) == {"rate_too_large"}
 
 
 def test_a_negative_signal_to_noise_ratio_is_not_a_number_for_a_reader():

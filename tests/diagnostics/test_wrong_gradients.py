@@ -209,7 +209,10 @@ def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
 # Without a least deviation the second measurement fails at the latest, and with one sample the first case's 34th
 @pytest.mark.parametrize(
     ("action_space", "logit", "n_times"),
-    [(spaces.Discrete(2), 5.11, 50), *product([spaces.Discrete(2), spaces.MultiDiscrete([2, 2, 2])], [8.1, 11.5], [5])],
+    [
+        pytest.param(spaces.Discrete(2), 5.11, 50, marks=pytest.mark.slow),
+        *product([spaces.Discrete(2), spaces.MultiDiscrete([2, 2, 2])], [8.1, 11.5], [5]),
+    ],
 )
 def test_a_rare_action_is_no_false_alarm(action_space, logit, n_times):
     """One with a probability of 0.006, 3e-4 or 1e-5, which comes twice as often as expected, or never."""

@@ -100,17 +100,17 @@ def test_models_have_the_settings_that_train_would_read(tmp_path, monkeypatch):
 
 def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(tmp_path, plots, monkeypatch, capsys):
     output = tmp_path / "made" / "results.csv"
-    command = [sys.executable, str(BENCHMARKS / "compare.py"), "--tasks", "CartPole-v1", "--timesteps", "200"]
+    command = ["compare.py", "--tasks", "CartPole-v1", "--timesteps", "200", "--output", str(output)]
     command += ["--algorithms", "reinforce", "a2c", "--seeds", "0", "1", "--final-episodes", "10", "--processes", "1"]
-    command += ["--output", str(output)]
-    subprocess.run(command, check=True)
-    monkeypatch.setattr(sys, "argv", command[1:])
+    monkeypatch.setattr(sys, "argv", command)
+    with mock.patch.object(signal, "signal"):
+        compare.main()
+        with pytest.raises(SystemExit, match="Nothing to do"):
+            compare.main()
     results = pandas.read_csv(output)
     final = results[results["evaluation"] == "final"]
     runs = [("reinforce", 0), ("a2c", 0), ("reinforce", 1), ("a2c", 1)]
     assert list(zip(final["algorithm"], final["seed"], strict=True)) == runs
-    with mock.patch.object(signal, "signal"), pytest.raises(SystemExit, match="Nothing to do"):
-        compare.main()
     monkeypatch.setattr(sys, "argv", ["compare_plots.py", str(output), "--output", str(tmp_path / "picture")])
     plots.main()
     assert {path.name for path in tmp_path.glob("*.png")} == {"picture_curves.png", "picture_summary.png"}
@@ -119,6 +119,7 @@ def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(tmp_path, plots, 
     assert shown and float(shown[1]) == pytest.approx(median)
 
 
+@pytest.mark.slow
 def test_sigterm_ends_the_processes_too(tmp_path):
     output = tmp_path / "results.csv"
     arguments = ["--tasks", "CartPole-v1", "--algorithms", "reinforce", "--timesteps", "10000000", "--processes", "1"]

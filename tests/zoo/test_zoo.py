@@ -114,6 +114,7 @@ def test_statistics_of_normalization_come_back(tmp_path, capsys):
     assert "Loading running average" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_benchmark_evaluates_the_algorithms_of_this_package(folder, tmp_path):
     # The Zoo starts a process for each model: here only for this one
     shutil.copytree(folder / "logs" / "finite_difference" / RUN, tmp_path / "finite_difference" / RUN)
