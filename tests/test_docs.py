@@ -26,6 +26,7 @@ SMALL = {
     r"n_eval_episodes=\d+": "n_eval_episodes=2",
     r"n_episodes=100": "n_episodes=10",
     r"n_estimates=\d+": "n_estimates=3",
+    r"compare_starts\(model\)": "compare_starts(model, n_starts=4)",
     # A rollout of PPO has 2048 steps of each environment
     r'"CartPole-v1", n_envs=8': '"CartPole-v1", n_envs=2',
 }

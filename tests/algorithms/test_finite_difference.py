@@ -152,7 +152,7 @@ def test_candidates_sample_only_on_request(deterministic):
 
 
 def test_it_learns_the_line():
-    model = make(make_vec_env(Line, 8), estimator="regression", n_delta=8, learning_rate=0.1).learn(3000)
+    model = make(make_vec_env(Line, 8), estimator="regression", n_delta=8, learning_rate=0.1).learn(1500)
     assert float(model.theta) == pytest.approx(3, abs=0.2)
 
 

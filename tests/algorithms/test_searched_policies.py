@@ -144,7 +144,7 @@ def test_a_perturbation_and_an_estimator_of_the_user():
         return (plus - minus) @ deltas / (2 * (deltas**2).sum())
 
     ones = lambda k, n, generator: th.ones(k, n)  # noqa: E731
-    model = make(Line(), estimator=estimator, perturbation=ones, learning_rate=0.1).learn(2000)
+    model = make(Line(), estimator=estimator, perturbation=ones, learning_rate=0.1).learn(1000)
     assert float(model.theta) == pytest.approx(3, abs=0.3)
 
 
