@@ -85,7 +85,7 @@ RUN = {
     ]
     for name, text in TEXTS.items()
 }
-# A benchmark takes seconds even so, and no user runs it
+# Benchmarks take seconds even so; whether their options exist is checked below each time
 SLOW = [name for name, found in RUN.items() if any("examples/benchmarks" in command for command in found)]
 WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo) \w|\.py\b.* --")
 

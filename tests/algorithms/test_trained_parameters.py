@@ -137,9 +137,9 @@ def test_noise_that_acts_in_training_mode_only_is_trained(share):
         pytest.param("mlp_extractor", {"step": "natural"}, marks=pytest.mark.slow),
         ("mlp_extractor", {"step": "natural", "baseline": "leave_one_out", "n_steps": None}),
         pytest.param("action_net", {"step": "natural"}, marks=pytest.mark.slow),
-        pytest.param("evaluate_actions", {}, marks=pytest.mark.slow),
+        ("evaluate_actions", {}),
         pytest.param("evaluate_actions", {"step": "natural"}, marks=pytest.mark.slow),
-        ("evaluate_actions", {"baseline": "optimal", "n_steps": None}),
+        pytest.param("evaluate_actions", {"baseline": "optimal", "n_steps": None}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
