@@ -106,7 +106,7 @@ def own_starts(thetas):
 variances = {}
 deltas = th.eye(3, dtype=th.float64)
 for name, function in (("common starts", utility), ("own starts", own_starts)):
-    gradients = th.stack([central_difference(function, utility.theta, deltas) for _ in range(16)])
+    gradients = th.stack([central_difference(function, utility.theta, deltas) for _ in range(8)])
     variances[name] = gradients.var(0).sum().item()
     print(f"{name:14s} variance of the gradient {variances[name]:8.0f}")
 print(f"ratio {variances['own starts'] / variances['common starts']:.1f}")

@@ -56,7 +56,7 @@ assert check.passed
 
 # %%
 estimators = ("likelihood_ratio", "forward", "central")
-table = compare_estimators(model, n_episodes=400, n_estimates=100, estimators=estimators, seed=seed)
+table = compare_estimators(model, n_episodes=400, n_estimates=60, estimators=estimators, seed=seed)
 print(table)
 likelihood_ratio, forward, central = (row.snr_per_step.value for row in table)
 assert likelihood_ratio > 3 * max(forward, central)
@@ -69,7 +69,7 @@ assert table["forward"].snr_per_step.high < table["central"].snr_per_step.low
 # ## A picture
 #
 # $U(\theta)$ on a plane through $\theta$: along the gradient of 1000 episodes, and along a random direction at a right
-# angle to it. A single estimate is one draw, so twelve of each are drawn. The angle of a fan is the noise within the
+# angle to it. A single estimate is one draw, so eight of each are drawn. The angle of a fan is the noise within the
 # plane; the printed cosines count all ten parameters. The fans have 10, 20 and 200 episodes for an estimate.
 
 
@@ -92,10 +92,10 @@ def regression(n_delta):
 
 truth = score_gradient("value", 1000)
 fans = {
-    "REINFORCE, no baseline, 10 episodes": [score_gradient("none", 10) for _ in range(12)],
-    "REINFORCE, critic, 10 episodes": [score_gradient("value", 10) for _ in range(12)],
-    "regression, 20 perturbations": [regression(20) for _ in range(12)],
-    "regression, 200 perturbations": [regression(200) for _ in range(12)],
+    "REINFORCE, no baseline, 10 episodes": [score_gradient("none", 10) for _ in range(8)],
+    "REINFORCE, critic, 10 episodes": [score_gradient("value", 10) for _ in range(8)],
+    "regression, 20 perturbations": [regression(20) for _ in range(8)],
+    "regression, 200 perturbations": [regression(200) for _ in range(8)],
 }
 fans = {name: th.stack(fan) for name, fan in fans.items()}
 cosines = {name: th.cosine_similarity(fan, truth[None]).mean().item() for name, fan in fans.items()}

@@ -28,7 +28,7 @@ SMALL = {
     r"n_estimates=\d+": "n_estimates=3",
     r"compare_starts\(model\)": "compare_starts(model, n_starts=4)",
     # A rollout of PPO has 2048 steps of each environment
-    r'"CartPole-v1", n_envs=8': '"CartPole-v1", n_envs=2',
+    r'"CartPole-v1", n_envs=8': '"CartPole-v1", n_envs=1',
 }
 # What CI appends to a command, by the script or the command of the Zoo, so that it takes seconds
 BUDGETS = {

@@ -1,7 +1,7 @@
 """
 Random configurations: each trains, stays finite and counts exactly.
 
-``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand of each instead of forty.
+``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand of each instead of 25.
 """
 
 import os
@@ -20,7 +20,7 @@ from sb3_reinforce import REINFORCE, FiniteDifference
 
 TABLES = {algorithm: algorithm._arguments for algorithm in (REINFORCE, FiniteDifference)}
 
-N_EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", 40))
+N_EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", 25))
 fuzzed = settings(
     max_examples=N_EXAMPLES,
     deadline=None,

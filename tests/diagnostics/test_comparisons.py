@@ -62,7 +62,7 @@ def test_equal_returns_leave_no_gradient(n_episodes):
     assert all(np.isnan(row.snr.value) for row in rows)
 
 
-@pytest.mark.parametrize("better", [0.5, 0.8, 0.2])
+@pytest.mark.parametrize("better", [0.5, 0.8, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_the_bandit_has_its_known_variances(better):
     """
     ``tr Σ = E‖s (r − b)‖² − ‖E g‖²`` with b = 0, b = E r, and the best constant, ``E[‖s‖² r] / E‖s‖²``.

@@ -126,6 +126,7 @@ def test_the_sign_of_a_mean_that_is_not_trained_does_not_pass_unchecked():
 SMALL = {"features_extractor_kwargs": {"features_dim": 16}}
 
 
+@pytest.mark.slow
 def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
     """Also where the parameters are not contiguous in memory."""
     env = FakeImageEnv(screen_height=84, screen_width=84, n_channels=1, discrete=True)

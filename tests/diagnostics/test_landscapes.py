@@ -88,7 +88,7 @@ def test_the_steps_of_each_estimator_are_those_of_its_episodes():
     assert {row.estimator: row.steps for row in table} == expected
 
 
-@pytest.mark.parametrize("algorithm", [REINFORCE, FiniteDifference])
+@pytest.mark.parametrize("algorithm", [REINFORCE, pytest.param(FiniteDifference, marks=pytest.mark.slow)])
 def test_all_estimators_see_the_same_gradient(algorithm):
     model = bandit(algorithm)
     table = compare_estimators(model, 200, 60, perturbation="sphere", n_delta=16, delta_std=1.0)

@@ -194,7 +194,7 @@ class Warm(ActorCriticPolicy):
         return actions, values, self.evaluate_actions(obs, actions)[1]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
     for policy, is_right in ((Greedy, False), ("MlpPolicy", True)):
         model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=seed)

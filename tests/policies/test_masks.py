@@ -31,7 +31,7 @@ def takes_only_allowed_actions(algorithm, task, n_steps, **kwargs):
     env = make_vec_env(lambda: environment(task), 4, seed=0)
     model = make(algorithm, env, learning_rate=0.05, **kwargs).learn(n_steps)
     for deterministic in (False, True):
-        evaluate_policy(model, env, n_eval_episodes=8, deterministic=deterministic, warn=False)
+        evaluate_policy(model, env, n_eval_episodes=4, deterministic=deterministic, warn=False)
     return sum(env.get_attr("n_steps"))
 
 

@@ -159,7 +159,9 @@ def test_the_shipped_train_env_kwargs_are_of_tasks_with_settings():
     assert published["train_env_kwargs"].keys() <= published.keys()
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "reinforce" else [pytest.mark.slow]) for name in ALGORITHMS]
+)
 def test_optuna_tunes_and_its_trials_can_be_trained(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     study = ("--storage", "study.log", "--study-name", "study", "--eval-freq", "-1", "-n", "200")
