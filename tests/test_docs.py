@@ -25,7 +25,7 @@ SMALL = {
     r"learn\(\d[\d_]*": "learn(1_000",
     r"n_eval_episodes=\d+": "n_eval_episodes=2",
     r"n_episodes=100": "n_episodes=10",
-    r"n_estimates=\d+": "n_estimates=3",
+    r"n_estimates=\d+": "n_estimates=3, n_episodes=10",
     r"compare_starts\(model\)": "compare_starts(model, n_starts=4)",
     # A rollout of PPO has 2048 steps of each environment
     r'"CartPole-v1", n_envs=8': '"CartPole-v1", n_envs=1',

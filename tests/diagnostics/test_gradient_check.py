@@ -57,7 +57,7 @@ PARTS = spaces.Dict(image=spaces.Box(0, 255, (36, 36, 1), np.uint8), vector=spac
 
 
 def trained(**kwargs):
-    return REINFORCE("MlpPolicy", "CartPole-v1", **kwargs).learn(3000)
+    return REINFORCE("MlpPolicy", "CartPole-v1", **kwargs).learn(1000)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ def make_model(n_envs=16, **kwargs):
     return REINFORCE("MlpPolicy", env, baseline="leave_one_out", seed=0)
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0])
+@pytest.mark.parametrize("scale", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_the_share_and_the_gains_are_found(scale):
     """
     With rewards ``scale · x ± 1`` the share is ``scale² / (scale² + 1)``.

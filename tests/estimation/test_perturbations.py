@@ -63,7 +63,7 @@ def test_coordinates_visit_all_parameters_with_alternating_sign():
     assert first.tolist() != second.tolist() != third.tolist()
 
 
-@pytest.mark.parametrize("k", [2, 4])
+@pytest.mark.parametrize("k", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_regression_on_a_few_coordinates_expects_a_multiple_of_the_gradient(k):
     """``ĝ_i = g_i − s_i (s · g) / k`` of the k measured coordinates of n, with random signs s of mean 0."""
     n, gradient = 4, th.tensor([3.0, 2.0, 4.0, 1.0]).double()
