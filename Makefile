@@ -26,7 +26,7 @@ docs:
 	python docs/_ext/check_html.py docs/_build/html
 	python -m sphinx -W --keep-going -q -d docs/_build/doctrees $(SPHINXOPTS) -b doctest docs docs/_build/doctest
 
-# Each asserts the numbers that it states
+# Seven each in two processes; each example asserts the numbers that it states
 examples:
 	ls examples/*.py | MPLBACKEND=agg xargs -n 7 -P 2 python .ci/in_turn.py
 

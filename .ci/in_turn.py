@@ -3,7 +3,11 @@
 import runpy
 import sys
 
-for path in sys.argv[1:]:
-    print(path, flush=True)
-    sys.argv[1:] = []
+paths = sys.argv[1:]
+# A script may read its own arguments
+del sys.argv[1:]
+for path in paths:
+    print(path)
     runpy.run_path(path, run_name="__main__")
+    # Otherwise the lines of two processes alternate
+    sys.stdout.flush()

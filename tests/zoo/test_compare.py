@@ -98,7 +98,6 @@ def test_models_have_the_settings_that_train_would_read(tmp_path, monkeypatch):
     assert replaced.step == "natural" and replaced.ent_coef == 0.5
 
 
-@pytest.mark.slow
 def test_a_finished_run_is_not_repeated_and_pictures_are_drawn(tmp_path, plots, monkeypatch, capsys):
     output = tmp_path / "made" / "results.csv"
     command = ["compare.py", "--tasks", "CartPole-v1", "--timesteps", "200", "--output", str(output)]

@@ -160,7 +160,7 @@ def test_the_shipped_train_env_kwargs_are_of_tasks_with_settings():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "reinforce" else [pytest.mark.slow]) for name in ALGORITHMS]
+    "name", ["reinforce", *(pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS if name != "reinforce")]
 )
 def test_optuna_tunes_and_its_trials_can_be_trained(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
