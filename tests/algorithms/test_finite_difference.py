@@ -135,6 +135,15 @@ def test_the_mean_of_the_standard_errors_is_logged():
     assert model.logger.name_to_value["train/standard_error"] == pytest.approx(float(errors.mean()))
 
 
+@pytest.mark.parametrize("kwargs", [dict(estimator="forward"), dict(estimator="central", n_top=15)])
+def test_no_standard_error_is_logged_where_the_gradient_is_another_fit(kwargs):
+    model = make(n_delta=30, learning_rate=0.0, **kwargs)
+    (estimate,) = estimates_of(model, 1)
+    model.train(estimate)
+    assert "train/residual_std" in model.logger.name_to_value
+    assert "train/standard_error" not in model.logger.name_to_value
+
+
 def test_n_top_uses_the_best_pair():
     (estimate,) = estimates(1, n_delta=4, n_top=1)
     utilities, candidates = estimate.utilities.reshape(2, 4), estimate.candidates.reshape(2, 4)
