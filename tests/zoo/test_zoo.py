@@ -135,7 +135,6 @@ def test_plots(folder, capsys):
     assert (folder / "figure.png").stat().st_size > 0
 
 
-@pytest.mark.slow
 def test_importing_is_all_that_a_script_around_the_zoo_needs(tmp_path):
     script = """
 import sys
