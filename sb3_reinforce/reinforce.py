@@ -131,8 +131,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         (Kakade, 2001) as far as ``target_kl`` allows: without a learning rate and without clipping. Use rollouts of at
         least 1,000 steps in all environments together. Policies whose log π differs in training mode, as with dropout,
         are refused
-    :param target_kl: With ``step="natural"``, the target of the rollout's mean KL(π_before ‖ π_after), which is at most
-        1.2 times it, before ``min_std`` and ``temperature`` are applied; it can be a schedule. None for 0.01
+    :param target_kl: With ``step="natural"``, the target for the rollout's mean KL(π_before ‖ π_after), or a schedule.
+        Steps are shortened until it is at most 1.2 times the target, before ``min_std`` and ``temperature`` are
+        applied. None for 0.01
     :param stats_window_size: Window size for the rollout logging, in episodes
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation; the dictionary is not modified

@@ -119,7 +119,7 @@ def plot_learning_curves(
     :param confidence: Probability with which an interval should cover the true value, at each point
     :param seed: Seed of the resamples
     :return: The Axes
-    :raises TypeError: If ``runs`` is no dictionary
+    :raises TypeError: If ``runs`` is not a dictionary
     :raises ValueError: If it is empty, there are fewer than two runs, or the shapes do not match
     """
     x = np.asarray(timesteps, dtype=float)
@@ -159,7 +159,7 @@ def plot_variances(
     :param ax: Axes to draw on; None for new ones
     :param confidence: Probability with which an interval should cover the true value
     :return: The Axes
-    :raises TypeError: If ``curves`` is no dictionary
+    :raises TypeError: If ``curves`` is not a dictionary
     :raises ValueError: If it is empty, there are fewer than two repetitions, or the shapes do not match
     """
     from scipy.stats import t as student_t
@@ -200,7 +200,7 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :param scape: The result of ``landscape``
     :param ax: Axes to draw on; None for new ones
     :return: The Axes
-    :raises TypeError: If ``scape`` is no ``Landscape``
+    :raises TypeError: If ``scape`` is not a ``Landscape``
     """
     check_kind("scape", scape, (Landscape,))
     ax = new_axes(ax, (6.0, 6.6))

@@ -36,7 +36,7 @@ class ActionMaskObservation(gym.Wrapper[dict[str, Any], Any, Any, Any]):
     """
     Adds the mask of an environment's ``action_masks()`` to its observations, under the key ``"action_mask"``.
 
-    An observation that is no dict becomes ``{"observation": ..., "action_mask": ...}``. The mask is an int8 array of
+    An observation that is not a dict becomes ``{"observation": ..., "action_mask": ...}``. The mask is an int8 array of
     shape ``(n,)``, 1 where an action is allowed: n is the number of actions for ``Discrete``, and for
     ``MultiDiscrete`` the sum of the numbers of each dimension, one dimension after the other. This is the contract of
     sb3-contrib's ``MaskablePPO``, so its environments with these actions can be wrapped as they are, and so can its
