@@ -165,7 +165,10 @@ def load_part(part: th.nn.Module | th.optim.Optimizer, name: str, state: Any, ex
         # Copies, or two models that one dict is given to would share their moments
         part.load_state_dict(deepcopy(dict(state)))
     elif exact_match:
-        raise ValueError(f"{needed}, but {reason}. set_parameters with exact_match=False leaves it out")
+        raise ValueError(
+            f"{needed}, but {reason}. If you have replaced the optimizer, make the model, replace it again, and call "
+            "set_parameters. With exact_match=False that leaves it out"
+        )
     else:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)
 

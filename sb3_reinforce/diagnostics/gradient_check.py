@@ -1,5 +1,6 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from sb3_reinforce.diagnostics.policy_errors import (
 )
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, seeded, training_weights
 from sb3_reinforce.diagnostics.tables import Table
-from sb3_reinforce.estimation.baselines import BASELINES
+from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
 from sb3_reinforce.estimation.weights import by_step, without_rounding
@@ -88,7 +89,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
     Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before
     the last are trained: Stable-Baselines3 detaches the features on which the standard deviation depends, unless
-    ``policy.action_dist.learn_features`` is set.
+    ``policy.action_dist.learn_features`` is set. It can also fail by rounding if observations are far from 1, below
+    about 0.01 or above 1,000: normalize them.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Number of episodes, at least 2
@@ -118,7 +120,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
 def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     """The error of each check; the last one trains the model's policy."""
-    collector = sampling_copy(model, n_episodes, model.baseline)
+    # A copy, since a baseline may learn from each rollout
+    collector = sampling_copy(model, n_episodes, copy.deepcopy(model.baseline))
     with undisturbed(model):
         rollout = collect_episodes(collector)
     policy = rollout.policy
@@ -138,7 +141,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
         "scores": score_error(policy, some_obs, some_actions),
         "sign": sign_error(policy, obs, len(actions)),
         "returns": return_error(collector, rollout),
-        "weights": weight_error(collector, rollout),
+        "weights": weight_error(copy.deepcopy(model.baseline), collector, rollout),
         "surrogate": surrogate_error(collector, rollout),
     }
 
@@ -173,10 +176,10 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
     return float(differences.abs().max() / expected.abs().max().clamp(min=1e-12))
 
 
-def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
+def weight_error(baseline: str | Baseline, collector: REINFORCE, rollout: Rollout) -> float:
     """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
-    baseline = check_function("baseline", collector.baseline, BASELINES)
-    differences = without_rounding(rollout.returns - baseline(rollout).cpu(), rollout.returns)
+    values = check_function("baseline", baseline, BASELINES)(rollout)
+    differences = without_rounding(rollout.returns - values.cpu(), rollout.returns)
     expected = differences.masked_fill(~rollout.used, 0.0)
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
 

@@ -20,6 +20,8 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
+# The scale by which parameters near 0 are moved: smaller ones drown in rounding, larger ones in the kinks of a ReLU
+LEAST_SCALE = 0.03
 # Random directions of the finite differences, and observations at which signs and samples are checked
 N_DIRECTIONS = 16
 N_OBSERVATIONS = 8
@@ -129,14 +131,15 @@ def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
     gradient = to_vector(th.autograd.grad(objective(), parameters, allow_unused=True, materialize_grads=True)).double()
     theta = to_vector(parameters)
-    directions = th.nn.functional.normalize(th.randn(N_DIRECTIONS, len(theta), device=theta.device))
+    # Each parameter moves by its own scale, or a layer of large weights would move the others far
+    scales = to_vector([each.square().mean().sqrt().clamp(min=LEAST_SCALE).expand_as(each) for each in parameters])
+    directions = scales * th.randn(N_DIRECTIONS, len(theta), device=theta.device)
     errors = []
     # In float32 the rounding of log π and the third derivative usually balance near eps^(1/3), the first h
     for h in (5e-3, 5e-4, 5e-5):
-        step = h * max(1.0, float(theta.norm()))
-        plus = values_at(theta + step * directions, parameters, objective)
-        minus = values_at(theta - step * directions, parameters, objective)
-        errors.append(relative_difference(directions.double() @ gradient, (plus - minus) / (2 * step)))
+        plus = values_at(theta + h * directions, parameters, objective)
+        minus = values_at(theta - h * directions, parameters, objective)
+        errors.append(relative_difference(directions.double() @ gradient, (plus - minus) / (2 * h)))
     return min(errors)
 
 

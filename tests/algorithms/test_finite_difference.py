@@ -13,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
-from sb3_reinforce.estimation import ESTIMATORS, central_difference, fit_quality
+from sb3_reinforce.estimation import ESTIMATORS, central_difference, fit_quality, regression_gradient
 from sb3_reinforce.estimation.perturbations import default_delta_std
 from sb3_reinforce.sampling.candidates import seeds_of
 
@@ -128,8 +128,14 @@ def test_the_mean_of_the_standard_errors_is_logged():
     assert model.logger.name_to_value["train/standard_error"] == pytest.approx(float(errors.mean()))
 
 
-@pytest.mark.parametrize("kwargs", [dict(estimator="forward"), dict(estimator="central", n_top=15)])
-def test_no_standard_error_is_logged_where_the_gradient_is_another_fit(kwargs):
+def small(utility, theta, deltas):
+    return 0.1 * regression_gradient(utility, theta, deltas)
+
+
+@pytest.mark.parametrize(
+    "kwargs", [dict(estimator="forward"), dict(estimator="central", n_top=15), dict(estimator=small)]
+)
+def test_no_standard_error_is_logged_where_the_gradient_is_no_regression(kwargs):
     model = make(n_delta=30, learning_rate=0.0, **kwargs)
     (estimate,) = estimates_of(model, 1)
     model.train(estimate)

@@ -105,11 +105,27 @@ def test_the_state_of_another_kind_of_optimizer_is_left_out(own, other, kind):
 
     states = make_with(other).learn(32).get_parameters()
     model = make_with(own)
-    with pytest.raises(ValueError, match=r"another optimizer\. set_parameters with exact_match=False leaves it out"):
+    with pytest.raises(ValueError, match=r"another optimizer\..* With exact_match=False that leaves it out"):
         model.set_parameters(states)
     with pytest.warns(UserWarning, match="It is left out"):
         model.set_parameters(states, exact_match=False)
     model.learn(32)
+
+
+@both
+def test_a_replaced_optimizer_is_replaced_again_before_its_state_is_loaded(kind, tmp_path):
+    def make_with_own():
+        model = make(kind, Corridor(), policy_kwargs={"net_arch": [4]})
+        model.policy.optimizer = th.optim.Adam(model.policy.action_net.parameters(), lr=1e-3)
+        return model
+
+    model = make_with_own().learn(32)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="replace it again, and call set_parameters"):
+        type(model).load(tmp_path / "model", env=Corridor())
+    again = make_with_own()
+    again.set_parameters(tmp_path / "model")
+    assert plain(again.get_parameters()) == plain(model.get_parameters())
 
 
 @both

@@ -86,6 +86,25 @@ def test_a_baseline_that_is_nan_at_unused_steps_passes():
     assert table.passed, table
 
 
+class MovingAverage:
+    """The reinforcement comparison of Williams (1992): a baseline that learns from each rollout."""
+
+    value = 0.0
+
+    def __call__(self, rollout):
+        values = th.full_like(rollout.returns, self.value)
+        self.value = 0.9 * self.value + 0.1 * float(rollout.returns[rollout.used].mean())
+        return values
+
+
+def test_a_baseline_with_memory_passes_and_keeps_it():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", n_episodes=8, baseline=MovingAverage(), seed=0).learn(500)
+    before = model.baseline.value
+    table = check_gradient(model)
+    assert table.passed, table
+    assert model.baseline.value == before > 0
+
+
 class Magnified(Corridor):
     """Observations in the thousands."""
 
@@ -114,6 +133,16 @@ def without_gradient(model, *names):
 def test_scores_that_lie_mostly_in_the_standard_deviation_pass(log_std_init, frozen):
     table = check_gradient(without_gradient(with_noise(log_std_init), *frozen), 2)
     assert table["sign"].passed, table
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_observations_pass(seed):
+    env = gym.make("CartPole-v1")
+    space = spaces.Box(-np.inf, np.inf, env.observation_space.shape)
+    env = gym.wrappers.TransformObservation(env, lambda obs: np.float32(0.01) * obs, space)
+    model = REINFORCE("MlpPolicy", env, seed=seed, policy_kwargs={"activation_fn": th.nn.ReLU})
+    table = check_gradient(model, seed=seed)
+    assert table["scores"].passed, table
 
 
 def test_the_sign_of_a_mean_that_is_not_trained_does_not_pass_unchecked():
