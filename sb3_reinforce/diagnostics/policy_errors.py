@@ -20,8 +20,6 @@ from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
 N_ELEMENTS = 2**21
-# The scale by which parameters near 0 are moved: smaller ones drown in rounding, larger ones in the kinks of a ReLU
-LEAST_SCALE = 0.03
 # Random directions of the finite differences, and observations at which signs and samples are checked
 N_DIRECTIONS = 16
 N_OBSERVATIONS = 8
@@ -66,9 +64,8 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     """
     ``difference_error``, and a fifth of it with the last layer scaled up to outputs of about 1, if that is larger.
 
-    The last layer of a new policy has small weights, with which the scores of the others hardly count. With larger
-    weights log π is curved more. Large logits, and their biases, are scaled down to 1: log π of an almost deterministic
-    policy is mostly rounding.
+    The last layer of a new policy has small weights, with which the scores of the others hardly count; larger ones
+    curve log π more. Large logits and biases are scaled to 1: if the policy is almost deterministic, log π is rounding.
     """
     # It may stand in another module, as with a mask
     parts = [part for name, part in policy.named_modules() if name.split(".")[0] == "action_net"]
@@ -131,8 +128,8 @@ def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
     gradient = to_vector(th.autograd.grad(objective(), parameters, allow_unused=True, materialize_grads=True)).double()
     theta = to_vector(parameters)
-    # Each parameter moves by its own scale, or a layer of large weights would move the others far
-    scales = to_vector([each.square().mean().sqrt().clamp(min=LEAST_SCALE).expand_as(each) for each in parameters])
+    # By the scale of each parameter, or large weights would move the others far; steps below 0.03 h drown in rounding
+    scales = to_vector([each.square().mean().sqrt().clamp(min=0.03).expand_as(each) for each in parameters])
     directions = scales * th.randn(N_DIRECTIONS, len(theta), device=theta.device)
     errors = []
     # In float32 the rounding of log π and the third derivative usually balance near eps^(1/3), the first h
