@@ -18,6 +18,7 @@ from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_sc
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import first_step, gradient_blocks, parameters_of
+from sb3_reinforce.estimation.weights import by_step
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph, log_prob_of, temperature_of
 from sb3_reinforce.policies.parameters import evaluation_mode
@@ -163,11 +164,13 @@ class PitfallCallback(Diagnosis):
         obs, actions = used_inputs(rollout)
         self.obs = obs
         self.temperature = temperature_of(policy)
+        self.targets = select(th.as_tensor(by_step(self.model.rollout_buffer)[1]), rollout.used)
         log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)
         if log_prob.requires_grad and (parameters := actor_parameters(policy, *first_step(rollout))):
             weights = select(training_weights(self.model), rollout.used).to(log_prob)
-            gradient = to_vector(th.autograd.grad((log_prob * weights).sum(), parameters, allow_unused=True))
+            objective = (log_prob * weights).sum() / rollout.denominator
+            gradient = to_vector(th.autograd.grad(objective, parameters, allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
         leave_no_graph(policy, *first_step(rollout))
 
@@ -207,7 +210,8 @@ class PitfallCallback(Diagnosis):
             explained_variance=logged.get("train/explained_variance", math.nan),
             gradient=self.gradient,
             return_scale=float(returns.square().mean().sqrt()),
-            return_std=float(returns.std(correction=0)),
+            target_scale=float(self.targets.square().mean().sqrt()),
+            target_std=float(self.targets.std(correction=0)),
             n_episodes=len(rollout.used_episodes),
             n_steps=len(returns),
             used_fraction=len(returns) / rollout.used.numel(),

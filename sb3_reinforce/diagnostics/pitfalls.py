@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -33,7 +34,8 @@ class Update:
     explained_variance: float  # of the critic
     gradient: th.Tensor  # some components, shape (c,); none if the actor is frozen
     return_scale: float  # root mean square of the returns
-    return_std: float
+    target_scale: float  # the same of the returns that the critic is fitted to: to go, also with total returns
+    target_std: float
     n_episodes: int  # parts of episodes count
     n_steps: int  # steps used
     used_fraction: float  # share of the steps that were used
@@ -162,8 +164,8 @@ def spikes_without_clipping(history: History) -> str | None:
 
 def useless_critic(history: History) -> str | None:
     """Values that explain none of the variance of the returns, after 100 updates and half of the training."""
-    # Returns that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
-    varied = [update for update in history.updates if update.return_std > 0.1 * update.return_scale]
+    # Targets that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
+    varied = [update for update in history.updates if update.target_std > 0.1 * update.target_scale]
     explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]
     late = history.n_updates >= 100 and history.progress_remaining < 0.5
     if history.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
@@ -200,7 +202,7 @@ def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
         # Not train/std, which with gSDE is a standard deviation of weights
         std = float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
         # A squashed policy acts on [-1, 1], whatever the space
-        half_width = 1.0 if policy.squash_output else float((space.high - space.low).mean() / 2)
+        half_width = 1.0 if policy.squash_output else float(np.subtract(space.high, space.low, dtype=float).mean() / 2)
         return min(1.0, std / half_width)
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):

@@ -83,8 +83,8 @@ def test_every_pitfall_has_a_task():
     assert {case[0] for case in TASKS} == set(PITFALLS)
 
 
-HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, return_scale=10.0, return_std=5.0)
-HEALTHY |= dict(n_episodes=16, n_steps=256, used_fraction=1.0)
+HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, return_scale=10.0)
+HEALTHY |= dict(target_scale=10.0, target_std=5.0, n_episodes=16, n_steps=256, used_fraction=1.0)
 
 
 def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, **kwargs):
@@ -107,9 +107,9 @@ spread = {"randomness": 1.0}
 peaked = {"randomness": 0.3}
 fixed = {"randomness": 0.01}
 spike = {"grad_norm": 10.1}
-unexplained = {"explained_variance": 0.0, "return_std": 1.1}
+unexplained = {"explained_variance": 0.0, "target_std": 1.1}
 late = {"progress": 0.49}
-constant_returns = {"explained_variance": -0.1, "return_std": 0.9}
+constant_targets = {"explained_variance": -0.1, "target_std": 0.9}
 cut = {"n_steps": 32, "baseline": "mean"}
 free = {"max_grad_norm": None}
 
@@ -137,7 +137,7 @@ free = {"max_grad_norm": None}
         ("useless_critic", seen(unexplained, n=25, **late), seen(unexplained, n=24, **late)),
         ("useless_critic", seen(unexplained, n=25, **late), seen(unexplained, n=25, n_updates=99, **late)),
         ("useless_critic", seen(unexplained, n=25, **late), seen({"explained_variance": 0.01}, n=25, **late)),
-        ("useless_critic", seen(unexplained, n=25, **late), seen(constant_returns, n=25, **late)),
+        ("useless_critic", seen(unexplained, n=25, **late), seen(constant_targets, n=25, **late)),
         ("deterministic_too_early", seen(fixed, progress=0.51), seen(fixed, progress=0.5)),
         ("deterministic_too_early", seen({"randomness": 0.049}), seen({"randomness": 0.051})),
         ("cut_episodes", seen({"used_fraction": 0.89}, **cut), seen({"used_fraction": 0.91}, **cut)),
@@ -204,10 +204,11 @@ def test_small_noise_weights_are_not_a_deterministic_policy():
 
 
 @th.no_grad()
-def test_noise_wider_than_the_actions_is_all_the_randomness_there_is():
-    policy = REINFORCE("MlpPolicy", Corridor(action_space=spaces.Box(-0.1, 0.1, (1,))), device="cpu").policy
+@pytest.mark.parametrize("space", [spaces.Box(-0.1, 0.1, (1,)), spaces.Box(-100, 100, (1,), np.int8)], ids=str)
+def test_noise_wider_than_the_actions_is_all_the_randomness_there_is(space):
+    policy = REINFORCE("MlpPolicy", Corridor(action_space=space), device="cpu").policy
     found = []
-    for std in (1.0, 0.05):
+    for std in (10.0 * space.high[0], space.high[0] / 2):
         policy.log_std.fill_(np.log(std))
         found.append(randomness(policy, th.zeros(1, *policy.observation_space.shape), entropy=0.0))
     assert found == pytest.approx([1.0, 0.5])
@@ -279,6 +280,17 @@ def test_one_environment_leaves_mostly_noise():
         assert healthy("CartPole-v1", 3_300, n_envs=1)[0].keys() == {"too_few_episodes"}
 
 
+@pytest.mark.filterwarnings("ignore:Every action is weighted by the total return")
+@pytest.mark.parametrize("reward_to_go", [True, False])
+def test_the_critic_is_judged_by_what_it_is_fitted_to(reward_to_go):
+    env = Corridor((5,), lambda t, action: 1.0)
+    model = REINFORCE("MlpPolicy", env, n_episodes=1, gamma=1.0, gae_lambda=1.0, reward_to_go=reward_to_go)
+    callback = PitfallCallback()
+    model.learn(5, callback)
+    (update,) = callback.updates
+    assert update.target_std == pytest.approx(np.std([5, 4, 3, 2, 1]))
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
@@ -291,12 +303,11 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
 
 
 @pytest.mark.parametrize("rollout", [{"n_steps": 300}, {"n_episodes": 3, "baseline": "none"}])
-def test_the_gradient_is_that_of_all_steps(rollout):
+def test_the_gradient_is_the_updates(rollout):
     """Its signal-to-noise ratio would be smaller for a part of a long rollout."""
     env = make_vec_env(lambda: Corridor((200,), lambda t, action: float(action)), 2, seed=0)
     kwargs = {"policy_kwargs": {"net_arch": [4]}, "seed": 0, "device": "cpu", **rollout}
     model = REINFORCE("MlpPolicy", env, learning_rate=0.0, max_grad_norm=None, **kwargs)
     callback = PitfallCallback()
     model.learn(1, callback)
-    norm = float(callback.gradient.norm()) / model.rollout.denominator
-    assert norm == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-4)
+    assert float(callback.gradient.norm()) == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-4)
