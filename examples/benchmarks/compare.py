@@ -196,7 +196,9 @@ def main() -> None:
         with Processes() as processes:
             runs = processes.exchange(runs)[0]
     if not runs:
-        raise SystemExit(f"Nothing to do: {arguments.output} has the {len(wanted)} runs that there are settings for")
+        there = f"{arguments.output} has the {len(wanted)} runs that there are settings for"
+        print(f"Nothing to do: {there}. Other -params need another --output")
+        return
     failed = []
     start = time.perf_counter()
     with contextlib.ExitStack() as stack:

@@ -65,8 +65,12 @@ def one_of_several(arguments: list[str]) -> Iterator[list[str]]:
         yield arguments
         return
     with Processes() as processes:
-        seed = processes.exchange(secrets.randbelow(2**31))[0]
-    arguments = ["--seed", str(seed), *arguments]
+        shared = processes.exchange(secrets.randbelow(2**31))[0]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--seed", type=int, default=-1)
+    given, _ = parser.parse_known_args(arguments)
+    # The Zoo draws a seed in place of a negative one
+    arguments = [*arguments, "--seed", str(shared if given.seed < 0 else given.seed)]
     if is_leader():
         yield arguments
         return

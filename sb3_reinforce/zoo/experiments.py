@@ -54,6 +54,8 @@ class Experiment(exp_manager.ExperimentManager):
         super().__init__(*arguments, **kwargs)
         self.model_config: Path | None = None
         self.argument_names = allowed_keys(self.algo) | ZOO_ARGUMENTS | {"observation_space", "action_space"}
+        # "VecNormalize only supports ...", "Observation spaces do not match"
+        self.argument_names |= {"vecnormalize", "observation", "action"}
         if kwargs.get("config") is None:
             self.config = str(HYPERPARAMS / f"{self.algo}.yml")
             written = Path(self.trained_agent).parent / self.env_name / "config.yml"
@@ -91,7 +93,10 @@ class Experiment(exp_manager.ExperimentManager):
                     f"There is no trial {self.trial_id} of {self.algo} in a study {self.study_name!r} of "
                     f"{self.storage}: pass another --trial-id, --study-name or --storage"
                 ) from error
-        found.update(self.custom_hyperparams or {})
+        replaced = self.custom_hyperparams or {}
+        if self.continue_training and (fixed := {"policy", "policy_kwargs"} & replaced.keys()):
+            raise ConfigurationError(f"-params {min(fixed)}: --trained-agent keeps the policy of the model")
+        found.update(replaced)
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)

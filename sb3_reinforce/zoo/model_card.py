@@ -59,10 +59,10 @@ Mean reward of {n_episodes} deterministic episodes, after training with seed {se
 """
 
 
-def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100) -> Path:
-    """Evaluate the last agent that ``train`` has saved in a folder, and write ``README.md`` beside it."""
+def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_id: int = 0) -> Path:
+    """Evaluate an agent that ``train`` has saved in a folder, the last or ``exp_id``; write ``README.md`` beside it."""
     env_name = utils.EnvironmentName(env_id)
-    _, model, run = utils.get_model_path(0, folder, name, env_name)
+    _, model, run = utils.get_model_path(exp_id, folder, name, env_name)
     saved = Path(run, env_name)
     arguments = yaml.unsafe_load((saved / "args.yml").read_text())
     for package in arguments["gym_packages"]:
@@ -114,8 +114,13 @@ def zoo_command(name: str, arguments: dict[str, Any]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--algo", required=True)
+    parser.add_argument("--algo", required=True, choices=list(ALGOS))
     parser.add_argument("--env", required=True)
     parser.add_argument("-f", "--folder", required=True)
+    parser.add_argument("--exp-id", type=int, default=0, help="number of the run; 0 for the last")
     given = parser.parse_args()
-    print(write_card(given.folder, given.algo, given.env))
+    try:
+        utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env))
+    except (AssertionError, ValueError) as error:
+        parser.error(f"{error}: pass another --folder, --algo, --env or --exp-id")
+    print(write_card(given.folder, given.algo, given.env, exp_id=given.exp_id))

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -69,6 +70,21 @@ def test_a_model_card_of_an_environment_in_a_namespace(tmp_path, monkeypatch):
     train("reinforce", "-n", "64", "-f", str(tmp_path), "--eval-freq", "-1", env="own/Pole-v0")
     card = write_card(str(tmp_path), "reinforce", "own/Pole-v0", n_episodes=2)
     assert card.parent.name == "own-Pole-v0_1" and "--env own/Pole-v0" in card.read_text()
+
+
+def test_a_model_card_without_an_agent_is_answered_with_a_sentence(tmp_path, monkeypatch, capsys):
+    command = ["model_card", "--algo", "reinforce", "--env", "CartPole-v1", "-f", str(tmp_path), "--exp-id", "3"]
+    monkeypatch.setattr(sys, "argv", command)
+    monkeypatch.delitem(sys.modules, "sb3_reinforce.zoo.model_card")
+    with pytest.raises(SystemExit):
+        runpy.run_module("sb3_reinforce.zoo.model_card", run_name="__main__")
+    assert "folder was not found: pass another --folder" in capsys.readouterr().err
+
+
+def test_a_model_continues_on_its_task_with_its_policy(folder, tmp_path, capsys):
+    command = [*REINFORCE, "-i", f"logs/reinforce/{RUN}/CartPole-v1.zip", "-f", str(tmp_path)]
+    assert "Observation spaces do not match" in message_of(capsys, *command, "--env", "Acrobot-v1")
+    assert "-params policy_kwargs: --trained" in message_of(capsys, *command, "-params", "policy_kwargs:dict()")
 
 
 def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
@@ -290,6 +306,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "--env", "Taxi-v4", "-params", "env_wrapper:'Nope'"], "env_wrapper must be the path of a class"),
         ([*REINFORCE, "--env", "Blackjack-v1"], "observation_space must be Box, Discrete, MultiDiscrete, "),
+        ([*REINFORCE, "--env", "FrozenLake-v1", "-params", "normalize:True"], "VecNormalize only supports"),
         ([*REINFORCE, "--device", "gpu9"], "device must be 'auto' or a device that PyTorch knows, got 'gpu9'"),
         ([*REINFORCE, "--conf-file", "nowhere.yml"], "nowhere.yml cannot be read"),
         ([*REINFORCE, "--conf-file", "broken.py"], "broken.py cannot be read: '{' was never closed"),
