@@ -355,9 +355,9 @@ class FiniteDifference(BasePolicyGradient):
         self.logger.record("train/r_squared", fit.r_squared)
         if not math.isnan(fit.residual_std):
             self.logger.record("train/residual_std", fit.residual_std)
-        # Forward differences share the noise of U(θ), and n_top selects by it: their errors are others
-        is_regression = self.estimator in ("regression", "central") and self.n_top is None
-        if is_regression and fit.standard_error is not None:
+        # Forward differences share the noise of U(θ), n_top selects by noise, and other estimators are not known
+        has_standard_error = self.estimator in ("regression", "central") and self.n_top is None
+        if has_standard_error and fit.standard_error is not None:
             self.logger.record("train/standard_error", float(fit.standard_error.mean()))
         self.logger.record("rollout/utility_mean", float(utilities.mean()))
         self.logger.record("rollout/utility_std", utility_std)

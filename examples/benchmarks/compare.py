@@ -196,8 +196,9 @@ def main() -> None:
         with Processes() as processes:
             runs = processes.exchange(runs)[0]
     if not runs:
-        there = f"{arguments.output} has the {len(wanted)} runs that there are settings for"
-        print(f"Nothing to do: {there}. Other -params need another --output")
+        if is_leader():
+            there = f"{arguments.output} has all {len(wanted)} runs that there are settings for"
+            print(f"Nothing to do: {there}. Other -params need another --output")
         return
     failed = []
     start = time.perf_counter()

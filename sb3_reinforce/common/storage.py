@@ -167,7 +167,7 @@ def load_part(part: th.nn.Module | th.optim.Optimizer, name: str, state: Any, ex
     elif exact_match:
         raise ValueError(
             f"{needed}, but {reason}. If you have replaced the optimizer, make the model, replace it again, and call "
-            "set_parameters. With exact_match=False that leaves it out"
+            "set_parameters, which leaves this state out with exact_match=False"
         )
     else:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)

@@ -164,7 +164,7 @@ class PitfallCallback(Diagnosis):
         obs, actions = used_inputs(rollout)
         self.obs = obs
         self.temperature = temperature_of(policy)
-        self.targets = select(th.as_tensor(by_step(self.model.rollout_buffer)[1]), rollout.used)
+        self.targets = select(th.as_tensor(by_step(self.model.rollout_buffer)[1]), rollout.used).clone()
         log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)
         if log_prob.requires_grad and (parameters := actor_parameters(policy, *first_step(rollout))):

@@ -1,13 +1,13 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
-import copy
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_reinforce.common.arguments import check_function, check_integer
+from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.policy_errors import (
     largest_difference,
@@ -92,7 +92,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     ``policy.action_dist.learn_features`` is set. It can also fail by rounding if observations are far from 1, below
     about 0.01 or above 1,000: normalize them.
 
-    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param model: The model; it is not changed, but a baseline with memory learns from these episodes too. The
+        environments are left at the start of an episode
     :param n_episodes: Number of episodes, at least 2
     :param seed: Seed of the actions and of the directions of the finite differences
     :return: A table with one ``CheckRow`` per item; ``.passed`` is True if all of them pass
@@ -118,10 +119,21 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     return CheckTable(f"Gradient check of {type(policy).__name__} ({n_episodes} episodes)", rows, legend)
 
 
+class Recorded:
+    """A baseline that keeps what it has returned: one with memory would return something else the next time."""
+
+    def __init__(self, function: Baseline):
+        self.function = function
+
+    def __call__(self, rollout: Rollout) -> th.Tensor:
+        self.values = self.function(rollout)
+        return self.values
+
+
 def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
     """The error of each check; the last one trains the model's policy."""
-    # A copy, since a baseline may learn from each rollout
-    collector = sampling_copy(model, n_episodes, copy.deepcopy(model.baseline))
+    baseline = Recorded(model.baseline) if callable(model.baseline) else model.baseline
+    collector = sampling_copy(model, n_episodes, baseline)
     with undisturbed(model):
         rollout = collect_episodes(collector)
     policy = rollout.policy
@@ -141,7 +153,7 @@ def measure_errors(model: REINFORCE, n_episodes: int) -> dict[str, float]:
         "scores": score_error(policy, some_obs, some_actions),
         "sign": sign_error(policy, obs, len(actions)),
         "returns": return_error(collector, rollout),
-        "weights": weight_error(copy.deepcopy(model.baseline), collector, rollout),
+        "weights": weight_error(collector, rollout),
         "surrogate": surrogate_error(collector, rollout),
     }
 
@@ -176,9 +188,10 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
     return float(differences.abs().max() / expected.abs().max().clamp(min=1e-12))
 
 
-def weight_error(baseline: str | Baseline, collector: REINFORCE, rollout: Rollout) -> float:
+def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
     """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
-    values = check_function("baseline", baseline, BASELINES)(rollout)
+    baseline = collector.baseline
+    values = baseline.values if isinstance(baseline, Recorded) else BASELINES[cast(str, baseline)](rollout)
     differences = without_rounding(rollout.returns - values.cpu(), rollout.returns)
     expected = differences.masked_fill(~rollout.used, 0.0)
     return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)

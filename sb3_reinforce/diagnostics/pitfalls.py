@@ -34,7 +34,7 @@ class Update:
     explained_variance: float  # of the critic
     gradient: th.Tensor  # some components, shape (c,); none if the actor is frozen
     return_scale: float  # root mean square of the returns
-    target_scale: float  # the same of the returns that the critic is fitted to: to go, also with total returns
+    target_scale: float  # root mean square of the critic's targets: returns to go, even if reward_to_go=False
     target_std: float
     n_episodes: int  # parts of episodes count
     n_steps: int  # steps used
@@ -163,7 +163,7 @@ def spikes_without_clipping(history: History) -> str | None:
 
 
 def useless_critic(history: History) -> str | None:
-    """Values that explain none of the variance of the returns, after 100 updates and half of the training."""
+    """Values that explain none of the variance of their targets, after 100 updates and half of the training."""
     # Targets that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
     varied = [update for update in history.updates if update.target_std > 0.1 * update.target_scale]
     explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]

@@ -66,11 +66,12 @@ def one_of_several(arguments: list[str]) -> Iterator[list[str]]:
         return
     with Processes() as processes:
         shared = processes.exchange(secrets.randbelow(2**31))[0]
+    arguments = ["--seed", str(shared), *arguments]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--seed", type=int, default=-1)
-    given, _ = parser.parse_known_args(arguments)
-    # The Zoo draws a seed in place of a negative one
-    arguments = [*arguments, "--seed", str(shared if given.seed < 0 else given.seed)]
+    parser.add_argument("--seed", type=int)
+    # In place of a negative seed the Zoo would draw one in each process
+    if parser.parse_known_args(arguments)[0].seed < 0:
+        arguments += ["--seed", str(shared)]
     if is_leader():
         yield arguments
         return

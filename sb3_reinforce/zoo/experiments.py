@@ -32,6 +32,8 @@ from sb3_reinforce.zoo.settings import (
 )
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
+# What Stable-Baselines3 says of normalize and --trained-agent
+UNFIT = re.compile("VecNormalize only supports|(Observation|Action) spaces do not match")
 # The policies that replace others where observations are dicts
 FOR_DICTS = dict.fromkeys(("MlpPolicy", "CnnPolicy", "LinearPolicy"), "MultiInputPolicy")
 FOR_DICTS |= dict.fromkeys(("MlpLstmPolicy", "CnnLstmPolicy"), "MultiInputLstmPolicy")
@@ -54,8 +56,6 @@ class Experiment(exp_manager.ExperimentManager):
         super().__init__(*arguments, **kwargs)
         self.model_config: Path | None = None
         self.argument_names = allowed_keys(self.algo) | ZOO_ARGUMENTS | {"observation_space", "action_space"}
-        # "VecNormalize only supports ...", "Observation spaces do not match"
-        self.argument_names |= {"vecnormalize", "observation", "action"}
         if kwargs.get("config") is None:
             self.config = str(HYPERPARAMS / f"{self.algo}.yml")
             written = Path(self.trained_agent).parent / self.env_name / "config.yml"
@@ -70,7 +70,7 @@ class Experiment(exp_manager.ExperimentManager):
             # Stable-Baselines3 asserts with a sentence that it supports the spaces; errors about an argument name it at
             # these places; all other errors keep their traceback
             named = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
-            is_unsupported = isinstance(error, AssertionError) and str(error)
+            is_unsupported = (isinstance(error, AssertionError) and str(error)) or UNFIT.match(str(error))
             if is_unsupported or not self.argument_names.isdisjoint(map(str.lower, named)):
                 raise ConfigurationError(str(error)) from error
             raise
@@ -95,7 +95,7 @@ class Experiment(exp_manager.ExperimentManager):
                 ) from error
         replaced = self.custom_hyperparams or {}
         if self.continue_training and (fixed := {"policy", "policy_kwargs"} & replaced.keys()):
-            raise ConfigurationError(f"-params {min(fixed)}: --trained-agent keeps the policy of the model")
+            raise ConfigurationError(f"--trained-agent keeps the model's policy: leave out -params {min(fixed)}")
         found.update(replaced)
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs

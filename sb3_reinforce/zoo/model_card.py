@@ -13,6 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
+from sb3_reinforce.zoo.settings import ConfigurationError
 
 # Options of ``train`` that change the result, and their names in ``args.yml``; ``enjoy`` needs some of them
 OPTIONS = {
@@ -60,9 +61,12 @@ Mean reward of {n_episodes} deterministic episodes, after training with seed {se
 
 
 def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_id: int = 0) -> Path:
-    """Evaluate an agent that ``train`` has saved in a folder, the last or ``exp_id``; write ``README.md`` beside it."""
+    """Evaluate a saved agent (run ``exp_id``, or the last if it is 0), and write ``README.md`` beside it."""
     env_name = utils.EnvironmentName(env_id)
-    _, model, run = utils.get_model_path(exp_id, folder, name, env_name)
+    try:
+        _, model, run = utils.get_model_path(exp_id, folder, name, env_name)
+    except (AssertionError, ValueError) as error:
+        raise ConfigurationError(f"{error}: pass another folder, algorithm, environment or --exp-id") from error
     saved = Path(run, env_name)
     arguments = yaml.unsafe_load((saved / "args.yml").read_text())
     for package in arguments["gym_packages"]:
@@ -120,7 +124,6 @@ if __name__ == "__main__":
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run; 0 for the last")
     given = parser.parse_args()
     try:
-        utils.get_model_path(given.exp_id, given.folder, given.algo, utils.EnvironmentName(given.env))
-    except (AssertionError, ValueError) as error:
-        parser.error(f"{error}: pass another --folder, --algo, --env or --exp-id")
-    print(write_card(given.folder, given.algo, given.env, exp_id=given.exp_id))
+        print(write_card(given.folder, given.algo, given.env, exp_id=given.exp_id))
+    except ConfigurationError as error:
+        parser.error(str(error))

@@ -128,17 +128,18 @@ def test_the_mean_of_the_standard_errors_is_logged():
     assert model.logger.name_to_value["train/standard_error"] == pytest.approx(float(errors.mean()))
 
 
-def small(utility, theta, deltas):
+def shrunk_regression(utility, theta, deltas):
     return 0.1 * regression_gradient(utility, theta, deltas)
 
 
 @pytest.mark.parametrize(
-    "kwargs", [dict(estimator="forward"), dict(estimator="central", n_top=15), dict(estimator=small)]
+    "kwargs", [dict(estimator="forward"), dict(estimator="central", n_top=15), dict(estimator=shrunk_regression)]
 )
 def test_no_standard_error_is_logged_where_the_gradient_is_no_regression(kwargs):
     model = make(n_delta=30, learning_rate=0.0, **kwargs)
     (estimate,) = estimates_of(model, 1)
     model.train(estimate)
+    assert fit_quality(estimate.candidates, estimate.utilities, estimate.gradient).standard_error is not None
     assert "train/residual_std" in model.logger.name_to_value
     assert "train/standard_error" not in model.logger.name_to_value
 

@@ -78,13 +78,15 @@ def test_a_model_card_without_an_agent_is_answered_with_a_sentence(tmp_path, mon
     monkeypatch.delitem(sys.modules, "sb3_reinforce.zoo.model_card")
     with pytest.raises(SystemExit):
         runpy.run_module("sb3_reinforce.zoo.model_card", run_name="__main__")
-    assert "folder was not found: pass another --folder" in capsys.readouterr().err
+    assert "folder was not found: pass another folder" in capsys.readouterr().err
 
 
 def test_a_model_continues_on_its_task_with_its_policy(folder, tmp_path, capsys):
     command = [*REINFORCE, "-i", f"logs/reinforce/{RUN}/CartPole-v1.zip", "-f", str(tmp_path)]
     assert "Observation spaces do not match" in message_of(capsys, *command, "--env", "Acrobot-v1")
-    assert "-params policy_kwargs: --trained" in message_of(capsys, *command, "-params", "policy_kwargs:dict()")
+    assert "keeps the model's policy: leave out -params policy_kwargs" in message_of(
+        capsys, *command, "-params", "policy_kwargs:dict()"
+    )
 
 
 def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
@@ -276,7 +278,13 @@ def test_what_could_not_be_read_again_is_refused(conf, sentence, tmp_path, capsy
 
 
 @pytest.mark.parametrize(
-    "error", [ValueError("another"), AssertionError(), TypeError("f() got an unexpected keyword argument 'x'")]
+    "error",
+    [
+        ValueError("another"),
+        ValueError("Action 7 is invalid"),
+        AssertionError(),
+        TypeError("f() got an unexpected keyword argument 'x'"),
+    ],
 )
 def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, monkeypatch):
     monkeypatch.setattr(ExperimentManager, "create_envs", mock.Mock(side_effect=error))
