@@ -75,8 +75,15 @@ def test_the_step_is_the_gradient_scaled_and_clipped(standardize, bound):
     th.testing.assert_close(model.theta - theta, expected, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("common_random_numbers", [True, False])
-@pytest.mark.parametrize("estimator", ["central", "regression"])
+@pytest.mark.parametrize(
+    ("estimator", "common_random_numbers"),
+    [
+        ("central", False),
+        ("regression", True),
+        pytest.param("central", True, marks=pytest.mark.slow),
+        pytest.param("regression", False, marks=pytest.mark.slow),
+    ],
+)
 def test_the_standard_error_is_the_spread_of_the_gradient(estimator, common_random_numbers):
     kwargs = dict(n_delta=12, estimator=estimator, common_random_numbers=common_random_numbers, deterministic=False)
     env = make_vec_env(Levels, 4, seed=0)

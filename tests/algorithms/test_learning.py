@@ -13,7 +13,7 @@ from sb3_reinforce import REINFORCE
 # What the other pairs would have in common with these, test_gradient states exactly
 CASES = [
     (IdentityEnv, "value"),
-    (IdentityEnvMultiDiscrete, "leave_one_out"),
+    pytest.param(IdentityEnvMultiDiscrete, "leave_one_out", marks=pytest.mark.slow),
     pytest.param(IdentityEnvMultiBinary, "value", marks=pytest.mark.slow),
     (IdentityEnvBox, "leave_one_out"),
 ]

@@ -133,7 +133,7 @@ def test_noise_that_acts_in_training_mode_only_is_trained(share):
 @pytest.mark.parametrize(
     ("part", "kwargs"),
     [
-        ("mlp_extractor", {}),
+        pytest.param("mlp_extractor", {}, marks=pytest.mark.slow),
         pytest.param("mlp_extractor", {"step": "natural"}, marks=pytest.mark.slow),
         ("mlp_extractor", {"step": "natural", "baseline": "leave_one_out", "n_steps": None}),
         pytest.param("action_net", {"step": "natural"}, marks=pytest.mark.slow),

@@ -29,7 +29,7 @@ from sb3_reinforce.estimation.baselines import score_products
     [
         *product(["none", "leave_one_out"], [2], [False, True]),
         *product(["optimal"], [3], [False, True]),
-        ("optimal", 4, True),
+        pytest.param("optimal", 4, True, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("reward_to_go", [False, True])
