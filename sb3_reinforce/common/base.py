@@ -200,7 +200,7 @@ class BasePolicyGradient(Distributed):
 
         :param env: As many environments as before, with the same spaces
         :param force_reset: Whether to reset them before training; whole episodes always begin with a reset
-        :raises TypeError: If ``env`` is not an environment, or ``force_reset`` not a flag
+        :raises TypeError: If ``env`` is not an environment, or ``force_reset`` is not a flag
         :raises ValueError: If their number or spaces are others
         """
         check_flag("force_reset", force_reset)

@@ -164,6 +164,7 @@ class PitfallCallback(Diagnosis):
         obs, actions = used_inputs(rollout)
         self.obs = obs
         self.temperature = temperature_of(policy)
+        # A copy: the buffer is reset before the update is examined
         self.targets = select(th.as_tensor(by_step(self.model.rollout_buffer)[1]), rollout.used).clone()
         log_prob = log_prob_of(policy, obs, actions)
         self.gradient = th.zeros(0)

@@ -65,7 +65,7 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     ``difference_error``, and a fifth of it with the last layer scaled up to outputs of about 1, if that is larger.
 
     The last layer of a new policy has small weights, with which the scores of the others hardly count; larger ones
-    curve log π more. Large logits and biases become 1: log π of an almost deterministic policy is mostly rounding.
+    curve log π more. Large logits and biases are scaled down to 1: log π near 0 is mostly rounding.
     """
     # It may stand in another module, as with a mask
     parts = [part for name, part in policy.named_modules() if name.split(".")[0] == "action_net"]
@@ -128,7 +128,7 @@ def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 
     gradient = to_vector(th.autograd.grad(objective(), parameters, allow_unused=True, materialize_grads=True)).double()
     theta = to_vector(parameters)
-    # In proportion to each tensor: one length for all would be too long for small ones. Steps below 0.03 h are rounding
+    # One length for all tensors would be too long for small ones, and steps below 0.03 h drown in rounding
     scales = to_vector([each.square().mean().sqrt().clamp(min=0.03).expand_as(each) for each in parameters])
     directions = scales * th.randn(N_DIRECTIONS, len(theta), device=theta.device)
     errors = []

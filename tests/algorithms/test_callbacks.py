@@ -53,6 +53,13 @@ def test_the_observation_of_a_step_is_the_models_last_one():
     assert np.array_equal(last.records, model.rollout_buffer.observations)
 
 
+def test_idle_environments_of_a_search_end_episodes_too():
+    ends = Record(lambda model: [ends.locals[name].sum() for name in ("dones", "finished")], "step")
+    env = make_vec_env(lambda: Corridor((4,)), 3)
+    make("search", env, n_delta=1, estimator="central").learn(1, ends)
+    assert np.sum(ends.records, axis=0).tolist() == [3, 2]
+
+
 @all_kinds
 def test_a_callback_stops_training_at_the_very_step(kind):
     model = make(kind, make_vec_env(lambda: Corridor((4,)), 2))
