@@ -167,7 +167,7 @@ class RecurrentREINFORCE(REINFORCE):
         return self._actor
 
     def _state_after_rollout(self) -> th.Tensor:
-        """The states at the cut; the critic's are computed from the rollout, in process 0 for the columns of all."""
+        """The states at the cut; the critic's come from the rollout, which in process 0 has the columns of all."""
         policy = self.policy
         rollout = self.rollout
         state = policy.zero_state(self.n_envs if rollout is None else rollout.dones.shape[1])

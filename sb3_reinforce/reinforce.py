@@ -424,8 +424,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         One policy step along ĝ, then the critic's passes.
 
-        :raises ValueError: If there is no rollout, a gradient is not finite, or a step makes a parameter that is not;
-            the parameters are then those before that step, or before the critic's passes
+        :raises ValueError: If there is no rollout, a gradient is not finite, a step makes a parameter that is not, or
+            with the natural step the policy's distribution has another log π. The parameters are then those before
+            that step, or before the critic's passes
         """
         rollout = self.rollout
         if rollout is None:
@@ -449,7 +450,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if trains_values and values is not None:
             # + vf_coef · mean_t (G_t − V(s_t))², for the features extractor that actor and critic share
             loss = loss + self.vf_coef * F.mse_loss(values, batch.returns.to(values))
-        grad_norm = kl = 0.0
+        grad_norm = 0.0
+        kl = 0.0
         # An actor may be frozen while its critic warms up
         if actor and loss.requires_grad:
             gradients = th.autograd.grad(loss, actor, allow_unused=True)
@@ -457,7 +459,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             self.policy.set_training_mode(False)
             grad_norm, kl = self._step_policy(batch, actor, gradients, log_prob.detach())
             self.policy.set_training_mode(True)
-        # load applies the temperature of this progress, and a model that is saved now must act like it
+        # load applies the temperature of this progress, and a model that is saved now must act as the loaded one
         self._apply_temperature_and_floor()
         self._n_updates += 1
 

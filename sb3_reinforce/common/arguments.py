@@ -42,9 +42,9 @@ def check_number(name: str, value: Any, low: float, high: float = MAX, above: bo
     """Return a number in the range as a float; with ``above``, ``low`` itself is excluded."""
     number = float(check_kind(name, value, (Real,), "a number"))
     if not low <= number <= high or (above and number == low):
-        allowed = f"{'finite and ' if high == MAX else ''}{'>' if above else '>='} {low:g}"
-        if high < MAX:
-            allowed = f"in {'(' if above else '['}{low:g}, {high:g}]"
+        bracket = "(" if above else "["
+        sign = ">" if above else ">="
+        allowed = f"in {bracket}{low:g}, {high:g}]" if high < MAX else f"finite and {sign} {low:g}"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 

@@ -112,11 +112,13 @@ class BasePolicyGradient(Distributed):
         """
         Get the policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
 
-        :param observation: The input observation
-        :param state: The last states of a recurrent policy; other policies pass it on
-        :param episode_start: Whether each observation is the first of an episode, for recurrent policies
+        :param observation: One observation, or a batch ``(n_envs, ...)``
+        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None where
+            episodes start. Other policies pass it on
+        :param episode_start: Whether each observation is the first of an episode, for recurrent policies, shape
+            ``(n_envs,)``
         :param deterministic: Whether to return the most likely action instead of a sample
-        :return: The action and the next state
+        :return: The action, or the actions ``(n_envs, *action_space.shape)``, and the next state
         """
         actions, state = super().predict(observation, state, episode_start, deterministic)
         return shift_to_start(self.action_space, actions), state

@@ -18,7 +18,7 @@ def step(
     max_grad_norm: float | None,
     name: str,
 ) -> float:
-    """Clip the gradients of a loss to a common norm, descend along them, and return the norm before clipping."""
+    """Clip the gradients of a loss by their common norm, descend along them, and return the norm before clipping."""
     if all(gradient is None for gradient in gradients):
         return 0.0
     norm = finite_norm(to_vector(gradients), name, REMEDY)

@@ -66,7 +66,7 @@ class Processes:
             # Process 0 may evaluate for hours before it calls learn() again
             dist.init_process_group("gloo", timeout=timedelta(days=365))
         self.rank, self.size = rank_and_size()
-        self.lines: dict[Any, int] = {}
+        self.connections: dict[Any, int] = {}
         # Whether the others have yet to send their parts of a rollout
         self.in_round = False
         # What these parts started from
@@ -85,21 +85,21 @@ class Processes:
         if self.rank > 0:
             dist.broadcast_object_list(invitation, src=0)
             *address, key = invitation[0]
-            line = Client(tuple(address), authkey=key)
-            line.send(self.rank)
-            self.lines[line] = 0
+            connection = Client(tuple(address), authkey=key)
+            connection.send(self.rank)
+            self.connections[connection] = 0
         else:
             key = secrets.token_bytes(32)
             with Listener(("", 0), backlog=self.size, authkey=key) as listener:
                 host = os.environ.get("MASTER_ADDR") or socket.gethostname()
                 dist.broadcast_object_list([(host, listener.address[1], key)], src=0)
-                while len(self.lines) < self.size - 1:
+                while len(self.connections) < self.size - 1:
                     # A stranger may have found the port
                     with suppress(AuthenticationError, EOFError, OSError):
-                        line = listener.accept()
-                        self.lines[line] = line.recv()
-        for line in self.lines:
-            with socket.fromfd(line.fileno(), socket.AF_INET, socket.SOCK_STREAM) as duplicate:
+                        connection = listener.accept()
+                        self.connections[connection] = connection.recv()
+        for connection in self.connections:
+            with socket.fromfd(connection.fileno(), socket.AF_INET, socket.SOCK_STREAM) as duplicate:
                 # A message above 16 KB goes in two parts, and the second would wait 0.04 s for an acknowledgement
                 duplicate.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -107,28 +107,29 @@ class Processes:
         """Send to all others, or to process 0; the next ``receive`` names a process that this does not reach."""
         # Plainly, since a connection's own pickling would move PyTorch's tensors to shared memory
         message = pickle.dumps(data)
-        for line in self.lines:
+        for connection in self.connections:
             with suppress(OSError):
-                line.send_bytes(message)
+                connection.send_bytes(message)
 
     def receive(self, timeout: float | None = None) -> list[Any]:
-        """What each other process sends next, in their order, or process 0; an error that one sends is raised."""
+        """The next message of each other process by rank, or of process 0; an error that one sends is raised."""
         received: dict[int, Any] = {}
         start = time.perf_counter()
-        missing = {*self.lines}
+        missing = {*self.connections}
         while missing and (ready := wait(missing, timeout)):
-            for line in cast(Any, ready):
+            for connection in cast(Any, ready):
                 try:
                     # The next message must begin where this one ends
                     with uninterrupted:
-                        data = pickle.loads(line.recv_bytes())
+                        data = pickle.loads(connection.recv_bytes())
                 except (EOFError, OSError, pickle.UnpicklingError) as error:
-                    message = f"Process {self.lines[line]} of {self.size} has died, or ended without a message"
+                    rank = self.connections[connection]
+                    message = f"Process {rank} of {self.size} has died, or ended without a message"
                     raise ProcessError(message) from error
                 if isinstance(data, Exception):
                     raise data
-                received[self.lines[line]] = data
-                missing.remove(line)
+                received[self.connections[connection]] = data
+                missing.remove(connection)
         self.waited += time.perf_counter() - start
         return [received[rank] for rank in sorted(received)]
 
@@ -162,11 +163,11 @@ class Processes:
             if error is not None:
                 self.fail(error)
         finally:
-            for line in self.lines:
-                line.close()
+            for connection in self.connections:
+                connection.close()
 
     def fail(self, error: BaseException) -> None:
-        """Send an error to the others, or send and raise the error of another process whose end has caused this one."""
+        """Send an error to the others; if another process's error has caused it, send and raise that one."""
         # BadData is an internal ValueError
         name = "ValueError" if isinstance(error, ValueError) else type(error).__name__
         reason = f"{name}: {error}".removesuffix(": ")

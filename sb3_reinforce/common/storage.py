@@ -39,7 +39,7 @@ def write_whole(target: PathOrFile, content: bytes) -> None:
     if path.is_dir():
         warnings.warn(f"{path} is a folder: the model is saved to {path}_2", stacklevel=3)
         path = path.with_name(f"{path.name}_2")
-    # Behind a link, which stays one
+    # The file that a link points to: the link stays a link
     path = path.resolve()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,8 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         for index, moments in state.get("state", {}).items():
             for key, moment in moments.items():
-                shape, needed = tuple(np.shape(moment)), tuple(parameters[index].shape)
+                shape = tuple(np.shape(moment))
+                needed = tuple(parameters[index].shape)
                 if shape not in ((), needed):
                     return f"its {key} of parameter {index} must have shape {needed}, got {shape}"
     return ""

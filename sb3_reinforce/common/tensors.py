@@ -11,7 +11,7 @@ TensorOrDict: TypeAlias = Any
 
 
 def map_parts(function: Callable[..., Any], *tensors: TensorOrDict) -> TensorOrDict:
-    """``function(*tensors)``; for dicts, a dict of its values under each key. Takes arrays too."""
+    """``function(*tensors)``, also of arrays; for dicts, a dict with its value for each key of the first."""
     first = tensors[0]
     if isinstance(first, dict):
         return {key: map_parts(function, *(each[key] for each in tensors)) for key in first}

@@ -75,7 +75,6 @@ class GradientQualityCallback(Diagnosis):
             check_critic(self.model, self.functions)
 
     def _forget(self) -> None:
-        """Start with a model of which nothing is known."""
         self.n_rollouts = 0
         self.thetas: deque[th.Tensor] = deque(maxlen=3)
 
@@ -151,7 +150,6 @@ class PitfallCallback(Diagnosis):
         super()._init_callback()
 
     def _forget(self) -> None:
-        """Start with a model of which nothing is known."""
         self.found: dict[str, str] = {}
         self.updates: deque[Update] = deque(maxlen=50)
         self.n_updates = 0

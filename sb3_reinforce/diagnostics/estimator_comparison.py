@@ -120,7 +120,8 @@ def compare_estimators(
     scale = default_delta_std(utility.theta) if delta_std is None else delta_std
     generator = th.Generator().manual_seed(seed)
     rows = []
-    with seeded(model.policy, seed), episode_bar(progress_bar) as utility.bar:
+    with seeded(model.policy, seed), episode_bar(progress_bar) as bar:
+        utility.bar = bar
         reference = likelihood_ratio(model, n_episodes)[0]
         for name in names:
             begin = time.perf_counter()

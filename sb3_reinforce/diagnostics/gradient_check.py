@@ -204,7 +204,7 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     expected = gradients.sum(0) / (int(rollout.used.sum()) if by_steps else len(rollout.used_episodes))
     parameters = parameters_of(rollout)
     before = to_vector(parameters)
-    # As long as θ if the gradient is shorter: a short step would drown in the rounding of θ
+    # A step as long as θ where the gradient is shorter: a short one would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
     collector.learning_rate = rate

@@ -142,8 +142,9 @@ def landscape(
         steps[name] = extent * projected(gradient, plane)
     scales = th.linspace(-extent, extent, n_points, dtype=th.float64)
     grid = th.stack(th.meshgrid(scales, scales, indexing="xy"), dim=-1).reshape(-1, 2)
-    bar = episode_bar(progress_bar, n_episodes * len(grid))
-    with seeded(cast(ActorCriticPolicy, model.policy), seed), bar as utility.bar:
+    episodes = episode_bar(progress_bar, n_episodes * len(grid))
+    with seeded(cast(ActorCriticPolicy, model.policy), seed), episodes as bar:
+        utility.bar = bar
         utilities = utility(utility.theta + grid @ plane).reshape(n_points, n_points)
     return Landscape(scales.numpy(), utilities.numpy(), steps, n_episodes)
 

@@ -39,7 +39,7 @@ class Update:
     n_episodes: int  # parts of episodes count
     n_steps: int  # steps used
     used_fraction: float  # share of the steps that were used
-    temperature: float = 1.0  # of the rollout
+    temperature: float  # of the rollout
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ PITFALLS: dict[str, Pitfall] = {
     "cut_episodes": cut_episodes,
 }
 
-# A pitfall that one of these explains is not reported after it. The rate of the policy is by default the critic's too
+# A pitfall is not reported after one of its causes. The policy's learning rate is by default the critic's too
 CAUSES = {
     "deterministic_too_early": {"rate_too_large"},
     "too_few_episodes": {"rate_too_large", "deterministic_too_early"},

@@ -62,7 +62,7 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
 
 def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
-    ``difference_error``, and a fifth of it with the last layer scaled up to outputs of about 1, if that is larger.
+    The larger one of ``difference_error`` and a fifth of it with the last layer scaled up to outputs of about 1.
 
     The last layer of a new policy has small weights, with which the scores of the others hardly count; larger ones
     curve log π more. Large logits and biases are scaled down to 1: log π near 0 is mostly rounding.
@@ -178,8 +178,8 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
     """
     The largest difference between the mean of −log π over sampled actions and the entropy, in standard errors.
 
-    It is measured at a few of the ``n_obs`` observations, and is the smaller one of two samples, in one of which a rare
-    action may be too frequent. An entropy without closed form is estimated from the sample, and there is no difference.
+    The measurement is at a few of the ``n_obs`` observations. The smaller error of two samples counts, since a rare
+    action may be too frequent in one. An entropy without closed form is estimated from the sample: no difference.
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     errors = []
@@ -218,7 +218,7 @@ def draw(policy: ActorCriticPolicy, one: PyTorchObs, n: int) -> th.Tensor:
 
 
 def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:
-    """The mean share of components that equal an action's, or for a Box minus the distance of the mean to it."""
+    """The mean share of components that equal an action's; for a Box, minus the distance from the mean to it."""
     if isinstance(policy.action_space, spaces.Box):
         distance: th.Tensor = (draws.mean(0) - action).norm()
         return -distance

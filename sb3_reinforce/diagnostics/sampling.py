@@ -16,6 +16,7 @@ from sb3_reinforce.common.arguments import check_flag, check_integer, check_kind
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import by_step, compute_weights
+from sb3_reinforce.policies.parameters import evaluation_mode
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 
@@ -72,19 +73,15 @@ def collect_episodes(collector: REINFORCE, bar: Any = None) -> Rollout:
 
 @contextmanager
 def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
-    """Seed PyTorch's generators of the CPU and of the policy's GPU in the block; restore them and the policy's mode."""
-    training = policy.training
+    """Seed PyTorch's generators of the CPU and of the policy's GPU in the block, in evaluation mode; restore both."""
     # th.manual_seed would seed the generators of all GPUs
     gpus = [policy.device] if policy.device.type == "cuda" else []
-    with th.random.fork_rng(gpus):
+    with th.random.fork_rng(gpus), evaluation_mode(policy):
         th.default_generator.manual_seed(seed)
         for gpu in gpus:
             with th.cuda.device(gpu):
                 th.cuda.manual_seed(seed)
-        try:
-            yield
-        finally:
-            policy.set_training_mode(training)
+        yield
 
 
 def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> None:

@@ -164,7 +164,7 @@ class GymnasiumVecEnv(VecEnv):
 
 def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.bool_]], Any] | None:
     """A function that starts new episodes in copies whose episode has ended; None if the environment does it itself."""
-    # Environments of one class share their metadata
+    # The metadata may belong to the class, so the attribute comes first
     mode = getattr(env.unwrapped, "autoreset_mode", env.metadata.get("autoreset_mode"))
     if mode is AutoresetMode.SAME_STEP:
         return None

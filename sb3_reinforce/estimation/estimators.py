@@ -191,6 +191,7 @@ def fit_quality(
     total = float(y @ y)
     residual_std = (squares / degrees_of_freedom) ** 0.5 if degrees_of_freedom > 0 else float("nan")
     is_determined = degrees_of_freedom > 0 and rank == len(gradient)
+    # (XᵀX)⁻¹ = X⁺ (X⁺)ᵀ at full rank: the roots of its diagonal are the norms of the rows of X⁺
     return Fit(
         r_squared=1 - squares / total if total > 0 else float("nan"),
         residual_std=residual_std,

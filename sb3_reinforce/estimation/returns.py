@@ -56,6 +56,7 @@ def lambda_return(
     """
     continues = ~np.asarray(dones, dtype=bool)
     continues[-1] = False
+    # G_t = r_t + γ (1 − λ c_t) V(s_{t+1}) + γ λ c_t G_{t+1}, with c_t = 1 where the episode goes on in the rollout
     return discounted_sum(rewards + gamma * (1 - gae_lambda * continues) * next_values, gamma * gae_lambda * continues)
 
 
@@ -88,4 +89,5 @@ def total_return(reward_to_go: Floats, timesteps: Integers, gamma: float, earlie
     steps = np.arange(len(timesteps))[:, None]
     from_start = gamma**timesteps * reward_to_go
     from_start[0] += earlier_rewards
+    # G_0 stands in the row of the episode's first step in the rollout
     return np.take_along_axis(from_start, np.maximum(steps - timesteps, 0), axis=0)

@@ -116,6 +116,7 @@ class Running:
         """The episodes that run when a rollout of shape ``(n_steps, n_envs)`` has ended."""
         timesteps = timesteps_of(dones, self.timesteps)
         runs_on = ~in_finished_episode(dones)
+        # Σ_{k<t} γ^k r_k of the episode that runs on, with what it had earned before the rollout
         earned = runs_on[0] * self.rewards + (runs_on * gamma**timesteps * rewards).sum(axis=0)
         return Running(np.where(dones[-1], 0, timesteps[-1] + 1), earned)
 
@@ -131,7 +132,7 @@ def in_finished_episode(dones: Bools) -> Bools:
 
 
 def timesteps_of(dones: Bools, first: Integers) -> Integers:
-    """t within the episode, ``(n_steps, n_envs)``: the row minus the row of its start, at first ``−first``."""
+    """t within the episode, ``(n_steps, n_envs)``: the row minus its first row, ``−first`` if it began earlier."""
     rows = np.arange(len(dones))[:, None]
     starts = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
     return rows - np.maximum.accumulate(starts, axis=0)

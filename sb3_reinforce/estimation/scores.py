@@ -91,7 +91,11 @@ def gradient_blocks(rollout: Rollout, *weights: th.Tensor, floats: int = 2 * CHU
 def sums_by_factors(
     rollout: Rollout, parameters: Parameters, layers: list[nn.Module], w: th.Tensor, episode: th.Tensor, chunk: int
 ) -> Iterator[tuple[int, th.Tensor]]:
-    """``Σ_t w_t ∇ log π`` over some steps of an episode, shape ``(k, n)``, from the factors of the scores."""
+    """
+    ``Σ_t w_t ∇ log π`` over some steps of an episode, shape ``(k, n)``, from the factors of the scores.
+
+    ``w`` is of shape ``(k, n_steps)``, and ``episode`` holds the number of each step's episode.
+    """
     policy = rollout.policy
     obs, actions = used_inputs(rollout)
     features = extract_features(policy, obs, policy.pi_features_extractor).detach()
@@ -113,7 +117,7 @@ def sums_by_factors(
 def sums_by_backward_passes(
     rollout: Rollout, parameters: Parameters, w: th.Tensor, episode: th.Tensor
 ) -> Iterator[tuple[int, th.Tensor]]:
-    """``Σ_t w_t ∇ log π`` over all steps of an episode, shape ``(k, n)``, by a backward pass for each of k weights."""
+    """The same over all steps of an episode, by a backward pass for each of the k weights of a step."""
     obs, actions = used_inputs(rollout)
     for number, steps in enumerate(steps_of(episode)):
         log_prob = log_prob_of(rollout.policy, take(obs, steps), actions[steps])
@@ -190,7 +194,8 @@ def score_factors(
 
 def trace(layers: list[nn.Module], x: th.Tensor) -> tuple[list[th.Tensor], list[th.Tensor], th.Tensor]:
     """The inputs x and the outputs z of the linear layers of a plain actor, and its logits or means."""
-    inputs, outputs = [], []
+    inputs = []
+    outputs = []
     # Gradients flow to the outputs of all layers, of frozen ones too
     x.requires_grad_()
     for layer in layers:

@@ -1,7 +1,6 @@
 """From rewards to the weights γ^t (G_t − b_t) of the scores, as functions of arrays."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.tensors import select
 from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
 from sb3_reinforce.estimation.rollout import (
     Rollout,
@@ -36,7 +36,7 @@ def complete_rollout(
     next_values: Floats | None,
     state: th.Tensor | None = None,
     *,
-    baseline: Callable[[Rollout], th.Tensor],
+    baseline: Baseline,
     gamma: float,
     gae_lambda: float,
     reward_to_go: bool,

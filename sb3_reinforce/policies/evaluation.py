@@ -19,7 +19,7 @@ from sb3_reinforce.policies.plain_mlp import (
     hooks_of,
     overrides,
     takes_vectors,
-    temperature_hooks,
+    temperature_hook,
 )
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 
@@ -181,8 +181,8 @@ def reached_by(compute: Callable[[], th.Tensor], parameters: Parameters) -> Para
 def temperature_of(policy: ActorCriticPolicy) -> float:
     """The temperature at which a policy acts."""
     layer = getattr(policy, "action_net", None)
-    hooks = temperature_hooks(layer) if layer is not None else []
-    return float(hooks[0].temperature) if hooks else 1.0
+    hook = None if layer is None else temperature_hook(layer)
+    return 1.0 if hook is None else float(hook.temperature)
 
 
 def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
@@ -196,12 +196,13 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
         if temperature != 1:
             raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
         return
-    hooks = temperature_hooks(layer)
-    if temperature != 1 and not hooks:
-        hooks = [DivideLogits(th.ones((), device=policy.device))]
-        layer.register_forward_hook(hooks[0])
-    for hook in hooks:
-        hook.temperature.fill_(max(temperature, MIN_TEMPERATURE))
+    hook = temperature_hook(layer)
+    if hook is None:
+        if temperature == 1:
+            return
+        hook = DivideLogits(th.ones((), device=policy.device))
+        layer.register_forward_hook(hook)
+    hook.temperature.fill_(max(temperature, MIN_TEMPERATURE))
 
 
 @th.no_grad()

@@ -121,12 +121,13 @@ def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor)
     for _ in range(N_ITERATIONS):
         if square <= PRECISION**2 * (b @ b):
             break
-        a_direction = product(direction)
-        step = square / (direction @ a_direction)
+        # Step rᵀr / dᵀAd along d; then r ← r − step · A d, and d ← r + (rᵀr after / rᵀr before) d
+        image = product(direction)
+        step = square / (direction @ image)
         if not 0 < step < math.inf:
             return th.zeros_like(b)
         x = x + step * direction
-        residual = residual - step * a_direction
+        residual = residual - step * image
         next_square = residual @ residual
         direction = residual + next_square / square * direction
         square = next_square
@@ -136,7 +137,7 @@ def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor)
 def line_search(
     parameters: Parameters, d: th.Tensor, length: float, divergence: Callable[[], th.Tensor], target_kl: float
 ) -> float | None:
-    """``θ − length · d``, shortened until the divergence is at most 1.2 times the target; returns it, or None."""
+    """Shorten ``θ − length · d`` until the divergence is at most 1.2 times the target; return it, or None."""
     before = to_vector(parameters)
     with ExitStack() as undo:
         undo.callback(write, parameters, before)

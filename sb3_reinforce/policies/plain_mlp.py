@@ -62,9 +62,9 @@ def hooks_of(module: nn.Module) -> list[Any]:
     return [hook for name in HOOKS if attributes[name] for hook in attributes[name].values()]
 
 
-def temperature_hooks(module: nn.Module) -> list[DivideLogits]:
-    """The temperature of a layer, in a list of at most one."""
-    return [hook for hook in hooks_of(module) if isinstance(hook, DivideLogits)]
+def temperature_hook(module: nn.Module) -> DivideLogits | None:
+    """The hook that holds the temperature of a layer, if it has one."""
+    return next((hook for hook in hooks_of(module) if isinstance(hook, DivideLogits)), None)
 
 
 @lru_cache
@@ -139,9 +139,8 @@ def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
 
 def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
     """The outputs over τ, if the last layer has a temperature."""
-    for hook in temperature_hooks(head):
-        outputs = outputs / hook.temperature
-    return outputs
+    hook = temperature_hook(head)
+    return outputs if hook is None else outputs / hook.temperature
 
 
 def has_numpy_form(layers: list[nn.Module]) -> bool:
@@ -163,7 +162,7 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
         linear_operation(layer.weight, layer.bias, n) if isinstance(layer, nn.Linear) else IN_PLACE[type(layer)]
         for layer in layers
     ]
-    hooks = temperature_hooks(layers[-1])
+    hook = temperature_hook(layers[-1])
 
     # As PyTorch, without warnings: some BLAS kernels read beyond the end of an array and flag what they find there
     @np.errstate(all="ignore")
@@ -171,14 +170,15 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
         x: Float32s = obs.reshape(n, -1).astype(np.float32, copy=False)
         for operation in operations:
             x = operation(x)
-        return x / np.float32(hooks[0].temperature) if hooks else x
+        return x if hook is None else x / np.float32(hook.temperature)
 
     return outputs
 
 
 def linear_operation(weight: th.Tensor, bias: th.Tensor, n: int) -> Callable[[Float32s], Float32s]:
     """``x Wᵀ + b`` as a function of x of shape ``(n, n_in)``, written to memory that is used again at each call."""
-    weight, bias = weight.detach(), bias.detach()
+    weight = weight.detach()
+    bias = bias.detach()
     transposed = weight.numpy().T
     addend = bias.numpy()
     y = np.empty((n, len(weight)), dtype=np.float32)

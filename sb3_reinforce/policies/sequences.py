@@ -177,9 +177,12 @@ def padded_index(sequence: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """The row at each place of padded sequences, shape ``(length, n_sequences)``, and which places are not padding."""
     order = sequence.argsort(stable=True)
     lengths = th.unique_consecutive(sequence[order], return_counts=True)[1]
-    places = th.arange(int(lengths.max()), device=sequence.device)[:, None]
-    is_row = places < lengths
-    index = order[(lengths.cumsum(0) - lengths + places).clamp(max=len(order) - 1)]
+    steps = th.arange(int(lengths.max()), device=sequence.device)[:, None]
+    is_row = steps < lengths
+    # Where each sequence begins in ``order``
+    firsts = lengths.cumsum(0) - lengths
+    # Padding takes any row
+    index = order[(firsts + steps).clamp(max=len(order) - 1)]
     return index, is_row
 
 
@@ -222,6 +225,7 @@ def sequence_minibatches(sequence: th.Tensor, size: int) -> Iterator[th.Tensor]:
     _, number, lengths = th.unique(sequence, return_inverse=True, return_counts=True)
     order = th.randperm(len(lengths)).to(sequence.device)
     batch = th.empty_like(order)
+    # In random order, a sequence belongs to the batch of its last row
     batch[order] = (lengths[order].cumsum(0) - 1) // size
     for each in th.unique(batch):
         yield (batch[number] == each).nonzero().flatten()

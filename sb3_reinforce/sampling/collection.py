@@ -96,9 +96,11 @@ def collect(
     has_values = calls(policy, "forward", with_critic)
     actor = actor_of(has_values, is_attached)
     as_env_actions = env_actions_of(policy)
+    # The first steps of episodes; the rows after the first are also ``dones``
     starts = [cast(Bools, model._last_episode_starts)]
     terminal_obs: TerminalObs = {}
-    n_steps = first_row = 0
+    n_steps = 0
+    first_row = 0
     while n_steps < extent.n_steps and not extent.is_complete:
         extent.check_length(n_steps)
         if n_steps == rollout_buffer.buffer_size:

@@ -29,7 +29,7 @@ class Columns:
 
 
 def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | None:
-    """In process 0 the columns of all processes, also in the buffer; elsewhere None, after its own are sent."""
+    """Process 0 writes the columns of all into the buffer and returns them; the others send theirs and return None."""
     if model._processes is None:
         return columns
     state = None if columns.state is None else columns.state.cpu()

@@ -2,7 +2,7 @@
 
 import copy
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.interruptions import interruptible
 from sb3_reinforce.envs.guards import guard
 from sb3_reinforce.envs.starts import give_new_seeds, start_episodes
+from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.sampling.normalization import frozen
 
 # Where the distribution of gSDE keeps its noise
@@ -37,9 +38,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
             yield
         finally:
             give_new_seeds(env)
-        obs = env.reset()
-    model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-    model._last_obs = obs  # type: ignore[assignment]
+        start_from(model, None)
 
 
 @contextmanager
@@ -53,8 +52,8 @@ def kept_noise(policy: Any) -> Iterator[None]:
         attributes.update(noise)
 
 
-def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
-    """Let the next rollout of a model consist of episodes from given seeds, and return their first observations."""
+def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer] | None) -> Any:
+    """Let the next rollout of a model start from given seeds, or any, and return its first observations."""
     env = cast(VecEnv, model.env)
     obs = start_episodes(env, seeds)
     model._last_obs = obs
@@ -62,7 +61,7 @@ def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer]) -> Any:
     return obs
 
 
-def sampling_copy(model: Any, n_episodes: int, baseline: str | Callable[..., Any] | None) -> Any:
+def sampling_copy(model: Any, n_episodes: int, baseline: str | Baseline | None) -> Any:
     """
     A copy of a REINFORCE for measurements of whole episodes: it shares policy and environments, with its own log,
     counters and rollouts. ``collect_rollouts`` resets the environments first. Without a baseline it has ``"value"``

@@ -158,7 +158,8 @@ def main() -> None:
             check(parser, command, arguments)
         sys.argv = [f"{parser.prog} {command}", *arguments]
         if command == "train":
-            with one_of_several(arguments) as sys.argv[1:]:
+            with one_of_several(arguments) as own_arguments:
+                sys.argv[1:] = own_arguments
                 importlib.import_module("rl_zoo3.train").train()
         elif command in SCRIPTS:
             run_script(command)

@@ -84,7 +84,7 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
     arguments["n_timesteps"] = max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"])
     arguments["log_folder"] = folder
     if arguments["trial_id"] is not None:
-        # Those of the trial, whose study others do not have
+        # The settings of the trial: others do not have its study
         arguments["hyperparams"] = settings
     path = Path(run, "README.md")
     card = CARD.format(

@@ -84,7 +84,7 @@ def test_every_pitfall_has_a_task():
 
 
 HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, return_scale=10.0)
-HEALTHY |= dict(target_scale=10.0, target_std=5.0, n_episodes=16, n_steps=256, used_fraction=1.0)
+HEALTHY |= dict(target_scale=10.0, target_std=5.0, n_episodes=16, n_steps=256, used_fraction=1.0, temperature=1.0)
 
 
 def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, **kwargs):
