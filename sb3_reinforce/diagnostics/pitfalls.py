@@ -163,14 +163,14 @@ def spikes_without_clipping(history: History) -> str | None:
 
 
 def useless_critic(history: History) -> str | None:
-    """Values that explain none of the variance of their targets, after 100 updates and half of the training."""
+    """Values that explain below 5 % of the variance of their targets, after 100 updates and half of the training."""
     # Targets that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
     varied = [update for update in history.updates if update.target_std > 0.1 * update.target_scale]
     explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]
     late = history.n_updates >= 100 and history.progress_remaining < 0.5
-    if history.model.has_critic and late and len(explained) >= 25 and median(explained) <= 0:
+    if history.model.has_critic and late and len(explained) >= 25 and median(explained) < 0.05:
         return (
-            f"The critic explains nothing of the returns: the median of train/explained_variance is "
+            f"The critic explains hardly anything of the returns: the median of train/explained_variance is "
             f"{median(explained):.2g}. Raise n_critic_updates={history.model.n_critic_updates!r} or "
             "critic_learning_rate, scale the returns (VecNormalize), or use another baseline"
         )

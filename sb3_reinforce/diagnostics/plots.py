@@ -61,7 +61,7 @@ def plot_baselines(table: Table[BaselineRow], ax: Axes | None = None) -> Axes:
     :return: The Axes
     :raises TypeError: If ``table`` is not the result of ``compare_baselines``
     """
-    check_kind("table", table, (Table,))
+    check_kind("table", table, (Table,), "the Table that compare_baselines returns")
     check_kind("table's first row", table.rows[0], (BaselineRow,), "a BaselineRow of compare_baselines")
     ax = new_axes(ax)
     rows = [row for row in table if row.baseline != "floor"]

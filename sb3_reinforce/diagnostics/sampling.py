@@ -86,7 +86,9 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
 
 def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> None:
     """Check the kind of a model, that it has environments, or also that its episodes are independent samples."""
-    check_kind("model", model, kinds, f"a {' or '.join(kind.__name__ for kind in kinds)}")
+    names = " or ".join(kind.__name__ for kind in kinds)
+    hint = "REINFORCE's set_parameters(..., exact_match=False) takes the policy of an A2C or PPO"
+    check_kind("model", model, kinds, f"a {names} ({hint})")
     if independent and model.use_sde and model.sde_sample_freq != 1:
         raise ValueError(
             f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, so they "

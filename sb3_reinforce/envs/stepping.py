@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
 
-from sb3_reinforce.envs.checks import as_reward, check_observation
+from sb3_reinforce.envs.checks import BadData, as_reward, check_observation
 
 IMMUTABLE = (bool, int, float, str, np.generic, NoneType)
 
@@ -28,6 +28,8 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
+        if not isinstance(info, dict):
+            raise BadData(f"The info of environment {i} must be a dict, got {info!r}")
         info = {key: value if isinstance(value, IMMUTABLE) else deepcopy(value) for key, value in info.items()}
         info["TimeLimit.truncated"] = truncated and not terminated
         if terminated or truncated:

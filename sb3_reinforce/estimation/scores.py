@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_reinforce.common.arguments import check_kind
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import flatten, select, take, to_vector
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
@@ -53,9 +54,11 @@ def gradients_by_episode(
     :param chunk: Floats that an intermediate result may take; the result does not depend on it
     :param columns: The components of θ to return, n in number
     :return: Shape ``(k, m, n)``, in the dtype and on the device of the parameters; the episodes are in ascending order
+    :raises TypeError: If ``rollout`` is not a ``Rollout``
     :raises ValueError: If there are no weights or they have another shape, or log π does not depend on any parameter
         in a way that can be differentiated
     """
+    check_kind("rollout", rollout, (Rollout,), "a Rollout, such as sample(model, n_episodes)")
     shape = rollout.used.shape
     wrong = [weight for weight in weights if not isinstance(weight, th.Tensor) or weight.shape != shape]
     if wrong or not weights:

@@ -170,6 +170,10 @@ def main() -> None:
         parser.error(f"{error}: install it, or correct its name; what the Zoo needs comes with the extra [zoo]")
     except (ConfigurationError, gym.error.DependencyNotInstalled, ImportError) as error:
         parser.error(str(error))
+    except FileNotFoundError as error:
+        if command not in PLOTS:
+            raise
+        parser.error(str(error))
     except ValueError as error:
         if command != "plot_from_file" or "empty sequence" not in str(error):
             raise

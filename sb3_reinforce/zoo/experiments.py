@@ -71,8 +71,11 @@ class Experiment(exp_manager.ExperimentManager):
             # these places; all other errors keep their traceback
             named = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
             is_unsupported = (isinstance(error, AssertionError) and str(error)) or UNFIT.match(str(error))
-            if is_unsupported or not self.argument_names.isdisjoint(map(str.lower, named)):
+            if is_unsupported:
                 raise ConfigurationError(str(error)) from error
+            if not self.argument_names.isdisjoint(map(str.lower, named)):
+                source = self.model_config or self.config
+                raise ConfigurationError(f"{error} (settings that -params does not give are from {source})") from error
             raise
 
     def learn(self, model: BaseAlgorithm) -> None:

@@ -3,13 +3,12 @@
 import importlib
 import re
 import runpy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import yaml
 from rl_zoo3 import exp_manager, utils
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -20,7 +19,7 @@ from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.reinforce import REINFORCE
 
 Settings = dict[str, Any]
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+ALGORITHMS: dict[str, type[BasePolicyGradient]] = {
     "reinforce": REINFORCE,
     "reinforce_lstm": RecurrentREINFORCE,
     "finite_difference": FiniteDifference,
@@ -70,12 +69,20 @@ def scheduled_keys(algorithm: str) -> set[str]:
     return {name for name, argument in arguments.items() if Schedule in get_args(argument.annotation)}
 
 
+def check_keys(algorithm: str, keys: Iterable[str]) -> None:
+    """Raise an error for a key that the algorithm's entry may not have; it says what to use instead."""
+    allowed = allowed_keys(algorithm)
+    for key in keys:
+        wrong = f"{algorithm} has no setting {key}"
+        if key in ALGORITHMS[algorithm]._instead and key not in allowed:
+            raise ConfigurationError(f"{wrong}: {ALGORITHMS[algorithm]._instead[key]}")
+        if key not in allowed:
+            raise ConfigurationError(str(unknown_name(f"{wrong}: a setting", "one of", sorted(allowed), key)))
+
+
 def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
     """Raise an error for settings that the Zoo would fail on; the algorithm checks its own arguments."""
-    allowed = allowed_keys(algorithm)
-    for key in hyperparams:
-        if key not in allowed:
-            raise ConfigurationError(str(unknown_name(f"A setting of {algorithm}", "one of", sorted(allowed), key)))
+    check_keys(algorithm, hyperparams)
     for key in ("policy", "n_timesteps"):
         if key not in hyperparams:
             raise ConfigurationError(f"The settings of {algorithm} must hold {key}, which the Zoo reads even with -n")

@@ -288,7 +288,7 @@ UNDRAWN = [np.ones((1, 8)), np.ones((3, 7)), np.ones(8)]
 @pytest.mark.parametrize(
     ("plot", "arguments", "named"),
     [
-        (plots.plot_baselines, (3,), "table must be Table, got 3"),
+        (plots.plot_baselines, (3,), "table must be the Table that compare_baselines returns, got 3"),
         (plots.plot_baselines, (Table("", [Estimate(0.0, 0.0, 0.0)], {}),), "BaselineRow of compare_baselines"),
         (plots.plot_landscape, (3,), "scape must be Landscape, got 3"),
         (plots.plot_learning_curves, ([1], [1]), "runs must be a dictionary"),

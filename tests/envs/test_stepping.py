@@ -87,6 +87,19 @@ def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
     assert sum(dones.sum() for (_, _, dones, _), _ in returned) > 50
 
 
+class Silent(Drawn):
+    """Returns None for the info of a step."""
+
+    def step(self, action):
+        return *super().step(action)[:4], None
+
+
+def test_an_info_that_is_not_a_dict_is_named():
+    model = make_model("steps", DummyVecEnv([lambda: Drawn("box"), lambda: Silent("box")]))
+    with pytest.raises(ValueError, match=r"The info of environment 1 must be a dict, got None \(num_timesteps=0\)"):
+        model.learn(8)
+
+
 @pytest.mark.parametrize("method", ["step", "step_async", "step_wait", "reset"])
 def test_methods_of_the_users_own_are_called(method):
     """Whether a subclass overrides them, or the user replaces them on one VecEnv."""

@@ -127,6 +127,12 @@ def test_wrong_weights_are_named(wrong):
         gradients_by_episode(collect(Corridor((2, 9))), *wrong)
 
 
+def test_a_model_in_place_of_a_rollout_is_named():
+    model = REINFORCE("MlpPolicy", Corridor((2, 9)), device="cpu")
+    with pytest.raises(TypeError, match=r"rollout must be a Rollout, such as sample\(model, n_episodes\), got <"):
+        gradients_by_episode(model, th.ones(3, 1))
+
+
 @pytest.mark.parametrize("frozen", ["mlp_extractor.policy_net.0.weight", "action_net.bias", "log_std"])
 def test_frozen_parameters_have_no_gradient(frozen):
     rollout = collect(Corridor((2, 9), action_space=BOX))

@@ -222,7 +222,9 @@ SETTINGS = [
     ("ent_coef: lin_x", "lin_NUMBER"),
     ("learning_rate: null", "learning_rate must be a number or a schedule, got None"),
     ("n_step: 5", "did you mean 'n_steps'"),
-    ("seed: 5", "A setting of reinforce must be one of 'baseline', "),
+    ("seed: 5", "reinforce has no setting seed: a setting must be one of 'baseline', "),
+    ("n_epochs: 5", "reinforce has no setting n_epochs: it takes one policy step per rollout"),
+    ("baseline: mean, gae_lambda: 0.9", "wrong.yml)"),
     ("gamma: 3", "gamma must be in [0, 1], got 3"),
     ("gamma: x", "gamma must be a number, got 'x' of type str"),
     ("policy_kwargs: 'dict('", "must be Python, but 'dict(' raises SyntaxError"),
@@ -321,6 +323,7 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         # A temperature in the default entry is left out, but not one that was asked for
         ([*PENDULUM, "-params", "temperature:0.5"], "temperature=0.5 is for discrete actions"),
         (["enjoy", "--algo", "reinforce"], "The rl-trained-agents/reinforce folder was not found: pass the folder"),
+        (["plot_from_file", "-i", "none.pkl"], "No such file or directory: 'none.pkl'"),
     ],
 )
 def test_a_wrong_command_is_answered_with_a_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
