@@ -26,9 +26,9 @@ docs:
 	python docs/_ext/check_html.py docs/_build/html
 	python -m sphinx -W --keep-going -q -d docs/_build/doctrees $(SPHINXOPTS) -b doctest docs docs/_build/doctest
 
-# Seven each in two processes; each example asserts the numbers that it states
+# Each example asserts the numbers that it states
 examples:
-	ls examples/*.py | MPLBACKEND=agg xargs -n 7 -P 2 python .ci/in_turn.py
+	MPLBACKEND=agg python .ci/in_turn.py $$(ls -v examples/*.py)
 
 # Agents for five tasks, with a model card each: python -m sb3_reinforce.zoo enjoy --algo reinforce --env Pendulum-v1 -f agents
 TASKS = MountainCar-v0:300000 Pendulum-v1:100000 Acrobot-v1:100000 MountainCarContinuous-v0:20000 CartPole-v1:50000

@@ -1,13 +1,21 @@
-"""Runs scripts one after another in one process, which imports PyTorch once."""
+"""Runs scripts in two processes, one after another in each, so that PyTorch is imported twice only."""
 
 import runpy
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
-paths = sys.argv[1:]
-# A script may read its own arguments
-del sys.argv[1:]
-for path in paths:
+
+def run(path: str) -> None:
     print(path)
     runpy.run_path(path, run_name="__main__")
-    # Otherwise the lines of two processes alternate
+    # Otherwise the lines of the two processes alternate
     sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    paths = sys.argv[1:]
+    # A script may read its own arguments
+    del sys.argv[1:]
+    with ProcessPoolExecutor(2) as pool:
+        # An error of a script is raised here
+        list(pool.map(run, paths))
