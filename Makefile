@@ -28,7 +28,7 @@ docs:
 
 # Each example asserts the numbers that it states
 examples:
-	MPLBACKEND=agg python .ci/in_turn.py $$(ls -v examples/*.py)
+	MPLBACKEND=agg python .ci/in_turn.py examples/*.py
 
 # Agents for five tasks, with a model card each: python -m sb3_reinforce.zoo enjoy --algo reinforce --env Pendulum-v1 -f agents
 TASKS = MountainCar-v0:300000 Pendulum-v1:100000 Acrobot-v1:100000 MountainCarContinuous-v0:20000 CartPole-v1:50000

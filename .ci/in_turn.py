@@ -1,4 +1,4 @@
-"""Runs scripts in two processes, one after another in each, so that PyTorch is imported twice only."""
+"""Runs scripts in two processes that take them from one queue, so that PyTorch is imported only twice."""
 
 import runpy
 import sys
@@ -6,7 +6,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 
 def run(path: str) -> None:
-    print(path)
+    print(path, flush=True)
     runpy.run_path(path, run_name="__main__")
     # Otherwise the lines of the two processes alternate
     sys.stdout.flush()

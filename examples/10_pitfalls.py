@@ -1,7 +1,7 @@
 # %% [markdown]
 # # What can go wrong, and how do you notice?
 #
-# `PitfallCallback` watches a run, changes nothing, and warns once about each of eight known pitfalls. In a healthy run
+# `PitfallCallback` watches a run, changes nothing, and warns once about each of nine known pitfalls. In a healthy run
 # it is silent. Here is a run for each pitfall.
 
 # %%
@@ -90,6 +90,8 @@ one_episode = {"baseline": "none", "n_episodes": 1}
 total_return = {"baseline": "none", "n_episodes": 4, "reward_to_go": False}
 runs = {
     "rate_too_large": ("CartPole-v1", 2000, {"learning_rate": 1.0}),
+    # PPO's defaults
+    "rate_too_small": ("CartPole-v1", 40_960, {"learning_rate": 3e-4, "n_steps": 2048, "gae_lambda": 0.95}),
     "unscaled_returns": (lambda: Task((5,), huge), 64, {}),
     "too_few_episodes": (lambda: Task((4,), noisy), 400, one_episode),
     "total_return": (lambda: Task((4,)), 64, total_return),

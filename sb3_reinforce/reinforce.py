@@ -424,9 +424,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         One policy step along ĝ, then the critic's passes.
 
-        :raises ValueError: If there is no rollout, a gradient is not finite, a step makes a parameter that is not, or
-            with the natural step the policy's distribution has another log π. The parameters are then those before
-            that step, or before the critic's passes
+        :raises ValueError: If there is no rollout, a gradient is not finite, a step makes a parameter that is not, or,
+            with the natural step, the policy's distribution does not give the log π that is trained. The parameters
+            are then those before that step, or before the critic's passes
         """
         rollout = self.rollout
         if rollout is None:

@@ -113,8 +113,8 @@ class BasePolicyGradient(Distributed):
         Get the policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
 
         :param observation: One observation, or a batch ``(n_envs, ...)``
-        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None where
-            episodes start. Other policies pass it on
+        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None at
+            the start of all episodes. Other policies pass it on
         :param episode_start: Whether each observation is the first of an episode, for recurrent policies, shape
             ``(n_envs,)``
         :param deterministic: Whether to return the most likely action instead of a sample

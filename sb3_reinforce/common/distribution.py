@@ -23,7 +23,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 # The arguments that processes need not have in common
 MAY_DIFFER = {"verbose", "device", "tensorboard_log"}
-# Before they collect, all take over process 0's attributes of these types; a ``_last_obs`` of None lets all reset
+# Before they collect, all take over process 0's attributes of these types; a ``_last_obs`` of None makes all reset
 SHARED = (bool, int, float, np.number, str, type(None), th.Generator)
 
 
@@ -148,7 +148,7 @@ class Distributed(BaseAlgorithm):
                 total.combine(each)
             all_waited += waited
         for own, *others in zip(*buffers, strict=True):
-            # In turns from the last episodes on, or those of the last process would fill the window
+            # The newest episodes of each process in turn: otherwise the last process would fill the window
             turns = zip_longest(*map(reversed, [own, *others]))
             newest_first = [each for turn in turns for each in turn if each is not None]
             own.clear()
@@ -169,7 +169,7 @@ class Distributed(BaseAlgorithm):
         try:
             self.adopt(*processes.receive())
             if self.num_timesteps == 0:
-                # The reset falls into the round, where a search has frozen VecNormalize: its candidates need one scale
+                # The reset is within the round, where a search has frozen VecNormalize: its candidates need one scale
                 self._last_obs = None
             while True:
                 self.collect_part(callback)

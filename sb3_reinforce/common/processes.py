@@ -118,17 +118,17 @@ class Processes:
         missing = {*self.connections}
         while missing and (ready := wait(missing, timeout)):
             for connection in cast(Any, ready):
+                rank = self.connections[connection]
                 try:
                     # The next message must begin where this one ends
                     with uninterrupted:
                         data = pickle.loads(connection.recv_bytes())
                 except (EOFError, OSError, pickle.UnpicklingError) as error:
-                    rank = self.connections[connection]
                     message = f"Process {rank} of {self.size} has died, or ended without a message"
                     raise ProcessError(message) from error
                 if isinstance(data, Exception):
                     raise data
-                received[self.connections[connection]] = data
+                received[rank] = data
                 missing.remove(connection)
         self.waited += time.perf_counter() - start
         return [received[rank] for rank in sorted(received)]

@@ -191,7 +191,7 @@ def check_reinforce(model: Any) -> None:
         raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
     if model.target_kl is not None and model.step != "natural":
         got = f"target_kl={model.target_kl!r} and step={model.step!r}"
-        reason = "it bounds a natural step, and there are no epochs that it could end, as PPO's does"
+        reason = "it bounds the natural step. PPO's target_kl ends epochs, and there are none here"
         raise ValueError(f"target_kl must be None unless step='natural', got {got}: {reason}")
     if isinstance(model.action_space, spaces.Box):
         if model.temperature != 1:

@@ -11,7 +11,7 @@ TensorOrDict: TypeAlias = Any
 
 
 def map_parts(function: Callable[..., Any], *tensors: TensorOrDict) -> TensorOrDict:
-    """``function(*tensors)``, also of arrays; for dicts, a dict with its value for each key of the first."""
+    """``function(*tensors)``, also of arrays; for dicts, a dict of the results by key."""
     first = tensors[0]
     if isinstance(first, dict):
         return {key: map_parts(function, *(each[key] for each in tensors)) for key in first}

@@ -12,7 +12,8 @@ from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import select, to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import check_critic, functions_of, weights_by
 from sb3_reinforce.diagnostics.diagnosis import Diagnosis
-from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update, randomness
+from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update
+from sb3_reinforce.diagnostics.randomness import randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
@@ -126,14 +127,15 @@ class GradientQualityCallback(Diagnosis):
 
 class PitfallCallback(Diagnosis):
     """
-    Warns once about each of eight known pitfalls of the policy gradient, and names the argument to change.
+    Warns once about each of nine known pitfalls of the policy gradient, and names the argument to change.
 
     Where several pitfalls have one cause, only the cause is reported.
 
-    The pitfalls: a learning rate that is too large, returns that are not scaled, too few episodes, the total return,
-    gradients that spike without clipping, a critic that explains nothing, a policy that is deterministic too early, and
-    episodes that are cut. They are detected from what training computes anyway; the cost is two forward passes and a
-    backward pass of the actor over each rollout. Training is not changed.
+    The pitfalls: a learning rate that is too large, or too small for the number of updates, returns that are not
+    scaled, too few episodes, the total return, gradients that spike without clipping, a critic that explains hardly
+    anything, a policy that is deterministic too early, and episodes that are cut. They are detected from what training
+    computes anyway; the cost is two forward passes and a backward pass of the actor over each rollout. Training is not
+    changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
 
@@ -153,6 +155,7 @@ class PitfallCallback(Diagnosis):
         self.found: dict[str, str] = {}
         self.updates: deque[Update] = deque(maxlen=50)
         self.n_updates = 0
+        self.path = 0.0
         self.rollout: Rollout | None = None
 
     def _on_rollout_end(self) -> None:
@@ -183,11 +186,13 @@ class PitfallCallback(Diagnosis):
         """Add the update after the last rollout to the history, and warn of new pitfalls."""
         if self.rollout is None or not self.logger.name_to_value:
             return
-        self.updates.append(self._describe_update(self.rollout))
+        update = self._describe_update(self.rollout)
+        self.updates.append(update)
         self.n_updates += 1
+        self.path += math.sqrt(2 * max(update.kl, 0.0))
         self.rollout = None
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.locals["total_timesteps"])
-        history = History(self.model, list(self.updates), self.n_updates, progress_remaining)
+        history = History(self.model, list(self.updates), self.n_updates, self.path, progress_remaining)
         for name, pitfall in PITFALLS.items():
             is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
             sentence = None if name in self.found or is_explained else pitfall(history)

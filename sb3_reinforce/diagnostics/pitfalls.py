@@ -11,15 +11,10 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_reinforce.common.settings import MAX_TEMPERATURE
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, signal_to_noise
-from sb3_reinforce.policies.evaluation import action_distribution
-from sb3_reinforce.policies.masks import FORBIDDEN
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL
 from sb3_reinforce.reinforce import REINFORCE
 
@@ -44,12 +39,13 @@ class Update:
 
 @dataclass(frozen=True)
 class History:
-    """What a pitfall is detected from: the last updates, at most 50, and the progress that remains, from 1 to 0."""
+    """What a pitfall is detected from."""
 
     model: REINFORCE
-    updates: list[Update]
+    updates: list[Update]  # the last ones, at most 50
     n_updates: int
-    progress_remaining: float
+    path: float  # Σ √(2 KL) over all updates
+    progress_remaining: float  # from 1 to 0
 
 
 Pitfall: TypeAlias = Callable[[History], str | None]
@@ -92,6 +88,26 @@ def rate_too_large(history: History) -> str | None:
         return (
             f"The entropy collapses: within {len(updates)} updates the policy went from {before:.0%} to {after:.0%} of "
             f"the randomness that it could have. {remedy}, or raise ent_coef"
+        )
+    return None
+
+
+def rate_too_small(history: History) -> str | None:
+    """
+    A path ``Σ √(2 KL)`` that, at the rate of the first half, stays below 0.3 in the whole training.
+
+    Even if all steps have one direction, the policy ends at a KL divergence of ``path² / 2``, 0.045, from its start.
+    """
+    left = history.progress_remaining
+    argument, value = step_bound(history)
+    # A rate of 0 is meant, as where the critic warms up
+    can_move = value > 0 and any(update.grad_norm > 0 for update in history.updates)
+    if can_move and left < 0.5 and history.n_updates >= 10 and history.path < 0.3 * (1 - left):
+        size = "n_episodes" if history.model.n_steps is None else "n_steps"
+        return (
+            f"The policy hardly changes: {history.n_updates} updates, in {1 - left:.0%} of the training, moved it by a "
+            f"KL divergence of at most {history.path**2 / 2:.2g}. Raise {argument} (now {value:.2g}), or lower {size} "
+            f"(now {getattr(history.model, size)}), which gives more updates"
         )
     return None
 
@@ -163,7 +179,7 @@ def spikes_without_clipping(history: History) -> str | None:
 
 
 def useless_critic(history: History) -> str | None:
-    """Values that explain below 5 % of the variance of their targets, after 100 updates and half of the training."""
+    """Values that explain less than 5 % of the variance of their targets, after 100 updates and half of training."""
     # Targets that vary by less than a tenth of their size, as of a pole that never falls, leave nothing to explain
     varied = [update for update in history.updates if update.target_std > 0.1 * update.target_scale]
     explained = [each.explained_variance for each in varied if math.isfinite(each.explained_variance)]
@@ -194,26 +210,6 @@ def deterministic_too_early(history: History) -> str | None:
     return None
 
 
-def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
-    """Entropy / largest entropy, or for a Box min(1, standard deviation / half the mean width); NaN if not known."""
-    space = policy.action_space
-    distribution: Any = action_distribution(policy, obs).distribution
-    if isinstance(space, spaces.Box):
-        # Not train/std, which with gSDE is a standard deviation of weights
-        std = float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
-        # A squashed policy acts on [-1, 1], whatever the space
-        half_width = 1.0 if policy.squash_output else float(np.subtract(space.high, space.low, dtype=float).mean() / 2)
-        return min(1.0, std / half_width)
-    parts = distribution if isinstance(distribution, list) else [distribution]
-    if all(isinstance(part, th.distributions.Categorical) for part in parts):
-        # Of a policy that prefers none of the actions that a mask allows
-        masked = FORBIDDEN / MAX_TEMPERATURE / 2
-        largest = float(sum((part.logits > masked).sum(-1).log().mean() for part in parts))
-    else:
-        largest = math.log(2) * math.prod(space.shape or ())
-    return entropy / largest if largest > 0 else math.nan
-
-
 def cut_episodes(history: History) -> str | None:
     """More than a tenth of the steps left out, because ``n_steps`` cuts their episodes and there is no critic."""
     model = history.model
@@ -228,6 +224,7 @@ def cut_episodes(history: History) -> str | None:
 
 PITFALLS: dict[str, Pitfall] = {
     "rate_too_large": rate_too_large,
+    "rate_too_small": rate_too_small,
     "unscaled_returns": unscaled_returns,
     "too_few_episodes": too_few_episodes,
     "total_return": uses_total_return,

@@ -62,7 +62,7 @@ def as_evaluated(policy: ActorCriticPolicy, drawn: th.Tensor) -> th.Tensor:
 
 def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
     """
-    The larger one of ``difference_error`` and a fifth of it with the last layer scaled up to outputs of about 1.
+    The larger of ``difference_error`` and a fifth of the error with the last layer scaled up to outputs of about 1.
 
     The last layer of a new policy has small weights, with which the scores of the others hardly count; larger ones
     curve log π more. Large logits and biases are scaled down to 1: log π near 0 is mostly rounding.
@@ -178,8 +178,8 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
     """
     The largest difference between the mean of −log π over sampled actions and the entropy, in standard errors.
 
-    The measurement is at a few of the ``n_obs`` observations. The smaller error of two samples counts, since a rare
-    action may be too frequent in one. An entropy without closed form is estimated from the sample: no difference.
+    It is measured at a few of the ``n_obs`` observations. The smaller error of two samples counts, since one may have a
+    rare action too often. An entropy without closed form is estimated from the sample itself: the error is then 0.
     """
     n_draws = max(256, min(1024, n_at_once(policy)))
     errors = []

@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -86,9 +87,10 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
 
 def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> None:
     """Check the kind of a model, that it has environments, or also that its episodes are independent samples."""
-    names = " or ".join(kind.__name__ for kind in kinds)
-    hint = "REINFORCE's set_parameters(..., exact_match=False) takes the policy of an A2C or PPO"
-    check_kind("model", model, kinds, f"a {names} ({hint})")
+    allowed = f"a {' or '.join(kind.__name__ for kind in kinds)}"
+    if isinstance(model, OnPolicyAlgorithm):
+        allowed += " (whose set_parameters(..., exact_match=False) takes the policy of an A2C or PPO)"
+    check_kind("model", model, kinds, allowed)
     if independent and model.use_sde and model.sde_sample_freq != 1:
         raise ValueError(
             f"model has use_sde=True and sde_sample_freq={model.sde_sample_freq}: its episodes share noise, so they "

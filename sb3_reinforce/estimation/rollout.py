@@ -132,7 +132,7 @@ def in_finished_episode(dones: Bools) -> Bools:
 
 
 def timesteps_of(dones: Bools, first: Integers) -> Integers:
-    """t within the episode, ``(n_steps, n_envs)``: the row minus its first row, ``−first`` if it began earlier."""
+    """t within the episode, ``(n_steps, n_envs)``: the row minus the episode's first, or ``−first`` if earlier."""
     rows = np.arange(len(dones))[:, None]
     starts = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
     return rows - np.maximum.accumulate(starts, axis=0)

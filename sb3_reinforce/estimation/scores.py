@@ -97,7 +97,7 @@ def sums_by_factors(
     """
     ``Σ_t w_t ∇ log π`` over some steps of an episode, shape ``(k, n)``, from the factors of the scores.
 
-    ``w`` is of shape ``(k, n_steps)``, and ``episode`` holds the number of each step's episode.
+    ``w`` has k rows and a column for each used step; ``episode`` holds the number of each used step's episode.
     """
     policy = rollout.policy
     obs, actions = used_inputs(rollout)
@@ -120,7 +120,7 @@ def sums_by_factors(
 def sums_by_backward_passes(
     rollout: Rollout, parameters: Parameters, w: th.Tensor, episode: th.Tensor
 ) -> Iterator[tuple[int, th.Tensor]]:
-    """The same over all steps of an episode, by a backward pass for each of the k weights of a step."""
+    """``Σ_t w_t ∇ log π`` over all steps of an episode, shape ``(k, n)``, by a backward pass for each of k weights."""
     obs, actions = used_inputs(rollout)
     for number, steps in enumerate(steps_of(episode)):
         log_prob = log_prob_of(rollout.policy, take(obs, steps), actions[steps])

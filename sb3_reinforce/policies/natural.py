@@ -137,7 +137,7 @@ def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor)
 def line_search(
     parameters: Parameters, d: th.Tensor, length: float, divergence: Callable[[], th.Tensor], target_kl: float
 ) -> float | None:
-    """Shorten ``θ − length · d`` until the divergence is at most 1.2 times the target; return it, or None."""
+    """Step to ``θ − length · d``, shortened until KL is at most 1.2 times the target; return KL, or None."""
     before = to_vector(parameters)
     with ExitStack() as undo:
         undo.callback(write, parameters, before)

@@ -96,7 +96,7 @@ def collect(
     has_values = calls(policy, "forward", with_critic)
     actor = actor_of(has_values, is_attached)
     as_env_actions = env_actions_of(policy)
-    # The first steps of episodes; the rows after the first are also ``dones``
+    # Which steps are the first of an episode; all rows but the first are also ``dones``
     starts = [cast(Bools, model._last_episode_starts)]
     terminal_obs: TerminalObs = {}
     n_steps = 0

@@ -53,11 +53,12 @@ def kept_noise(policy: Any) -> Iterator[None]:
 
 
 def start_from(model: BaseAlgorithm, seeds: NDArray[np.integer] | None) -> Any:
-    """Let the next rollout of a model start from given seeds, or any, and return its first observations."""
+    """Start episodes for a model's next rollout, from seeds or None for any; return their first observations."""
     env = cast(VecEnv, model.env)
     obs = start_episodes(env, seeds)
-    model._last_obs = obs
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+    # Last: after an interrupt before it, the model has no observation and resets its environments
+    model._last_obs = obs
     return obs
 
 

@@ -69,14 +69,14 @@ class Experiment(exp_manager.ExperimentManager):
         except (AssertionError, TypeError, ValueError) as error:
             # Stable-Baselines3 asserts with a sentence that it supports the spaces; errors about an argument name it at
             # these places; all other errors keep their traceback
-            named = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
+            found = re.findall(r"(?:^`?|, got |unexpected keyword argument ')(\w+)", str(error))
+            named = {*map(str.lower, found)}
             is_unsupported = (isinstance(error, AssertionError) and str(error)) or UNFIT.match(str(error))
-            if is_unsupported:
-                raise ConfigurationError(str(error)) from error
-            if not self.argument_names.isdisjoint(map(str.lower, named)):
-                source = self.model_config or self.config
-                raise ConfigurationError(f"{error} (settings that -params does not give are from {source})") from error
-            raise
+            if not (is_unsupported or self.argument_names & named):
+                raise
+            is_from_file = allowed_keys(self.algo) & named and self.trial_id is None
+            source = f" (settings without -params are from {self.model_config or self.config})" if is_from_file else ""
+            raise ConfigurationError(f"{error}{source}") from error
 
     def learn(self, model: BaseAlgorithm) -> None:
         """Train as the Zoo does, with callbacks in process 0 only: the Zoo ends the first of them itself."""

@@ -73,10 +73,10 @@ def check_keys(algorithm: str, keys: Iterable[str]) -> None:
     """Raise an error for a key that the algorithm's entry may not have; it says what to use instead."""
     allowed = allowed_keys(algorithm)
     for key in keys:
-        wrong = f"{algorithm} has no setting {key}"
-        if key in ALGORITHMS[algorithm]._instead and key not in allowed:
-            raise ConfigurationError(f"{wrong}: {ALGORITHMS[algorithm]._instead[key]}")
         if key not in allowed:
+            wrong = f"{algorithm} has no setting {key}"
+            if instead := ALGORITHMS[algorithm]._instead.get(key):
+                raise ConfigurationError(f"{wrong}: {instead}")
             raise ConfigurationError(str(unknown_name(f"{wrong}: a setting", "one of", sorted(allowed), key)))
 
 

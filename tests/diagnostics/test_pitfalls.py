@@ -1,5 +1,6 @@
 """Tasks made to fall into each pitfall, and healthy runs that give no warning."""
 
+import math
 import warnings
 from functools import partial
 
@@ -13,7 +14,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import PitfallCallback
-from sb3_reinforce.diagnostics.pitfalls import PITFALLS, History, Update, randomness
+from sb3_reinforce.diagnostics.pitfalls import PITFALLS, History, Update
+from sb3_reinforce.diagnostics.randomness import randomness
 
 BOX = spaces.Box(-1, 1, (2,))
 
@@ -66,6 +68,8 @@ TASKS = [
     ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),
     ("total_return", "reward_to_go=True", rewarded((4,)), 64, {**whole, "n_episodes": 4, "reward_to_go": False}),
     ("spikes_without_clipping", "max_grad_norm", Jackpot, 300, {**whole, "max_grad_norm": None}),
+    ("rate_too_small", "lower n_steps (now 32)", "CartPole-v1", 800, {"learning_rate": 1e-5}),
+    ("rate_too_small", "target_kl (now 1e-06)", "CartPole-v1", 800, {"step": "natural", "target_kl": 1e-6}),
     ("useless_critic", "n_critic_updates", rewarded((4,), noise), 4000, flat_critic),
     ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, one_action),
     ("deterministic_too_early", "ent_coef", rewarded((4,)), 640, certain),
@@ -87,17 +91,17 @@ HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, r
 HEALTHY |= dict(target_scale=10.0, target_std=5.0, n_episodes=16, n_steps=256, used_fraction=1.0, temperature=1.0)
 
 
-def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, **kwargs):
+def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, path=10.0, **kwargs):
     """What ``history`` makes a history of: n times these updates, of a model with these arguments."""
-    return updates * n, progress, signal, n_updates, kwargs
+    return updates * n, progress, signal, n_updates, path, kwargs
 
 
-def history(updates, progress, signal, n_updates, kwargs):
+def history(updates, progress, signal, n_updates, path, kwargs):
     """Updates that are healthy but for the figures given, whose gradients have a signal-to-noise ratio."""
     model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", **kwargs)
     gradients = th.randn(len(updates), 30, generator=th.Generator().manual_seed(0)) + signal**0.5
     made = [Update(gradient=g, **{**HEALTHY, **figures}) for g, figures in zip(gradients, updates, strict=True)]
-    return History(model, made, n_updates, progress)
+    return History(model, made, n_updates, path, progress)
 
 
 few = {"n_episodes": 4}
@@ -123,6 +127,12 @@ free = {"max_grad_norm": None}
         ("rate_too_large", seen({}, {"kl": 1.1}), seen({}, {"kl": 0.9})),
         ("rate_too_large", seen(spread, {"randomness": 0.49}), seen(spread, {"randomness": 0.51})),
         ("rate_too_large", seen(spread, *[peaked] * 9), seen(spread, *[peaked] * 10)),
+        ("rate_too_small", seen({}, path=0.15, **late), seen({}, path=0.16, **late)),
+        ("rate_too_small", seen({}, path=0.15, **late), seen({}, path=math.nan, **late)),
+        ("rate_too_small", seen({}, path=0.1, **late), seen({}, path=0.1, progress=0.5)),
+        ("rate_too_small", seen({}, path=0.1, n_updates=10, **late), seen({}, path=0.1, n_updates=9, **late)),
+        ("rate_too_small", seen({}, path=0.1, **late), seen({"grad_norm": 0.0}, path=0.1, **late)),
+        ("rate_too_small", seen({}, path=0.1, **late), seen({}, path=0.1, learning_rate=0.0, **late)),
         ("unscaled_returns", seen(large), seen({"return_scale": 999.0})),
         ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
         ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
@@ -153,7 +163,7 @@ def test_a_pitfall_starts_at_its_threshold(name, falls, stays):
     ("name", "case"), [("rate_too_large", seen({"kl": 1.5})), ("deterministic_too_early", seen(fixed))]
 )
 def test_the_natural_step_is_shortened_by_its_target(name, case):
-    sentence = PITFALLS[name](history(*case[:4], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
+    sentence = PITFALLS[name](history(*case[:5], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
     assert "ower target_kl" in sentence and "learning_rate" not in sentence
 
 
@@ -305,7 +315,7 @@ def test_nothing_is_said_of_a_long_healthy_run_of_lunar_lander():
         # Box2D is not there, or warns where it is imported, and an error there would not be caught
         warnings.simplefilter("ignore")
         pytest.importorskip("Box2D")
-    # With the default four passes and γ = 0.99 the critic of some seeds explains nothing for most of the run
+    # With the default four passes and γ = 0.99 the critic of some seeds explains hardly anything for most of the run
     assert healthy("LunarLander-v3", 150_000, gamma=0.999, n_critic_updates=10, batch_size=64) == ({}, 0)
 
 
