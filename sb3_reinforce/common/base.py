@@ -137,7 +137,8 @@ class BasePolicyGradient(Distributed):
         self._random_state = storage.generator_states(self.device)
         self._n_processes = rank_and_size()[1]
         buffer = BytesIO()
-        super().save(buffer, exclude, include)
+        # load knows the class by this argument
+        super().save(buffer, exclude, {*(include or ()), self._identifying_argument})
         storage.write_whole(path, buffer.getvalue())
 
     @classmethod

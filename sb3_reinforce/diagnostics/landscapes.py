@@ -91,6 +91,11 @@ class Landscape:
     steps: dict[str, np.ndarray]
     n_episodes: int
 
+    def __str__(self) -> str:
+        span = f"{self.utilities.min():.4g} to {self.utilities.max():.4g}"
+        points = f"{len(self.scales)} x {len(self.scales)} points"
+        return f"Utilities from {span} at {points}, {self.n_episodes} episodes each; plot_landscape draws them"
+
 
 def landscape(
     model: BaseAlgorithm,
