@@ -67,5 +67,5 @@ assert learned["MaskedPolicy"] > 3 * learned["MlpPolicy"] > 0
 assert learned["MaskedPolicy"] - learned["MlpPolicy"] > untrained["MaskedPolicy"] - untrained["MlpPolicy"]
 
 # %% [markdown]
-# Most of the difference is learned. With the mask an untrained policy opens almost four times as many doors, so there
-# are more successes to learn from.
+# Most of the difference between the two is learned. With the mask an untrained policy opens almost four times as many
+# doors, so there are more successes to learn from.

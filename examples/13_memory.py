@@ -2,8 +2,8 @@
 # # When must a policy remember?
 #
 # In a T-maze (Bakker, 2001) the first observation says whether the goal is to the left or to the right of the junction
-# at the end of a corridor. Every later one only says where the corridor ends. The turn towards the goal earns 1 and the
-# other one −1, so a policy without a memory can do no better than 0. The likelihood ratio holds for partial
+# at the end of a corridor. Every later one only says whether this is the junction. The turn towards the goal earns 1
+# and the other one −1, so a policy without a memory can do no better than 0. The likelihood ratio holds for partial
 # observations as it stands: only $\log \pi$ is differentiated, now back through the memory to the start of each
 # episode.
 #

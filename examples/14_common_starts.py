@@ -98,6 +98,6 @@ for i, (cost_alone, cost_grouped) in enumerate(zip(alone, grouped, strict=True),
 assert grouped[1] < alone[1] and grouped[2] < alone[3]
 
 # %% [markdown]
-# Episodes should share their start where the start decides most of the return, as here: the groups cost less after the
-# same number of episodes. With eight of the seeds 0 to 9 (not listed) they also cost less after 4,096 episodes than
-# independent starts after 8,192.
+# Episodes should share their start where the start decides most of the return, as here: policies that were trained on
+# groups cost less after the same number of episodes. On eight of the ten seeds 0 to 9 (not listed) they also cost less
+# after 4,096 episodes than policies that were trained on independent starts after 8,192.

@@ -47,12 +47,12 @@ assert check.passed
 #
 # One estimate is one episode for the likelihood ratio, whose baseline comes from the other episodes. For the others it
 # is one episode for each perturbed policy. Each parameter is perturbed alone: by +1 and −1 in a central difference, by
-# one of the two at random in a forward one. What curvature adds to a forward difference therefore cancels in the mean,
-# but is noise until then. A regression would use both signs and solve the equation of the central difference, so it is
-# left out. The perturbations are large, since the noise of single episodes drowns smaller differences. The cosine is
-# between the *expected* estimate and the gradient. The signal-to-noise ratio is divided by the steps. Perturbed
-# policies that share a start wait for the longest episode of their round, and these steps count: with one environment
-# the differences need fewer.
+# one of the two at random in a forward one. The error that curvature adds to a forward difference therefore cancels in
+# the mean, but is noise in each estimate. A regression would use both signs and solve the equation of the central
+# difference, so it is left out. The perturbations are large, since the noise of single episodes drowns smaller
+# differences. The cosine is between the *expected* estimate and the gradient. The signal-to-noise ratio is divided by
+# the steps. Perturbed policies that share a start wait for the longest episode of their round, and these steps count:
+# with one environment the differences need fewer.
 
 # %%
 estimators = ("likelihood_ratio", "forward", "central")

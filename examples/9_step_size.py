@@ -67,9 +67,9 @@ assert small[40] < 0.62 and small[400] < 0.93 and baseline[20] > 0.99 and baseli
 
 # %% [markdown]
 # The large step with one episode ends on the wrong action in many runs. The small step loses none, but it is slow at
-# first. With twenty episodes a step eight times as large loses only a few runs in a hundred. For the same data this
-# gains little: a rate of 0.2 with one episode is the same rate per episode, and loses 3 to 5 runs in a hundred. The
-# baseline makes the difference. With it, the rate of 4 is the fastest and loses no run.
+# first. With twenty episodes a rate of 4, eight times the large rate, loses only a few runs in a hundred. For the same
+# data this gains little: it is a rate of 0.2 per episode, and the rate 0.2 with one episode loses 3 to 5 runs in a
+# hundred. The baseline makes the difference. With it, the rate of 4 is the fastest and loses no run.
 #
 # ## How noisy is the gradient of a real run?
 #

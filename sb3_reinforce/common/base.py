@@ -115,8 +115,7 @@ class BasePolicyGradient(Distributed):
         :param observation: One observation, or a batch ``(n_envs, ...)``
         :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None at
             the start of all episodes. Other policies pass it on
-        :param episode_start: Whether each observation is the first of an episode, for recurrent policies, shape
-            ``(n_envs,)``
+        :param episode_start: Which observations start an episode, ``(n_envs,)``, for recurrent policies
         :param deterministic: Whether to return the most likely action instead of a sample
         :return: The action, or the actions ``(n_envs, *action_space.shape)``, and the next state
         """
