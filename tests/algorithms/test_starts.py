@@ -32,6 +32,11 @@ ENVS = {
 }
 
 
+def pendulum(n_envs):
+    """Episodes of 20 steps: what matters is where they start."""
+    return make_vec_env("Pendulum-v1", n_envs, seed=0, env_kwargs={"max_episode_steps": 20})
+
+
 def first_observations():
     return Record(lambda model: model.rollout_buffer.observations[0])
 
@@ -173,7 +178,7 @@ def test_pending_seeds_are_used_up():
 
 
 @pytest.mark.parametrize("at", ["step", "rollout_end"])
-@pytest.mark.parametrize("n_steps", [None, 200])
+@pytest.mark.parametrize("n_steps", [None, 20])
 def test_a_callback_may_turn_groups_off(n_steps, at):
     """The environments are independent from the next rollout on, also where all episodes ended at once."""
 
@@ -183,23 +188,23 @@ def test_a_callback_may_turn_groups_off(n_steps, at):
             model.n_steps = n_steps
             model.n_episodes = None if n_steps else 8
 
-    env = make_vec_env("Pendulum-v1", 8, seed=0)
+    env = pendulum(8)
     model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0)
     starts = first_observations()
-    model.learn(3 * 1600, callback=[Record(change, at), starts])
+    model.learn(3 * 160, callback=[Record(change, at), starts])
     assert [len(np.unique(rows, axis=0)) for rows in starts.records[:3]] == [2, 8, 8]
 
 
 def test_a_callback_may_turn_common_random_numbers_off():
     """The perturbations are too small to act differently, so that equal starts have equal steps."""
-    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    env = pendulum(4)
     model = FiniteDifference("LinearPolicy", env, estimator="forward", n_delta=3, delta_std=1e-12, seed=0)
 
     def change(model):
         model.common_random_numbers = False
 
     states = Record(lambda model: np.unique(env.get_attr("state"), axis=0), at="step")
-    model.learn(2 * 1600, callback=[Record(change), states])
+    model.learn(2 * 160, callback=[Record(change), states])
     assert len(states.records[0]) == 1
     assert len(states.records[-2]) == 4
 
@@ -214,15 +219,15 @@ MEASUREMENTS = {
 @pytest.mark.parametrize("name", MEASUREMENTS)
 def test_training_does_not_repeat_its_starts_after_measurements(name):
     """Which seed PyTorch's generator."""
-    model = REINFORCE("MlpPolicy", make_vec_env("Pendulum-v1", 4, seed=0), n_steps=200, seed=0)
+    model = REINFORCE("MlpPolicy", pendulum(4), n_steps=20, seed=0)
     starts = first_observations()
-    model.learn(3 * 800, callback=[starts, Record(MEASUREMENTS[name])])
+    model.learn(3 * 80, callback=[starts, Record(MEASUREMENTS[name])])
     assert len({rows.tobytes() for rows in starts.records}) == 3
 
 
 def test_after_a_landscape_the_environments_are_independent_again():
     """Its points have common starts."""
-    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    env = pendulum(4)
     model = REINFORCE("MlpPolicy", env, seed=0)
     landscape(model, n_points=3, n_episodes=2)
     assert len(np.unique(model._last_obs, axis=0)) == 4
@@ -234,7 +239,7 @@ def test_after_a_landscape_the_environments_are_independent_again():
 
 @pytest.mark.parametrize("measure", [sample, compare_starts])
 def test_after_groups_the_environments_are_independent_again(measure):
-    env = make_vec_env("Pendulum-v1", 8, seed=0)
+    env = pendulum(8)
     model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", episodes_per_start=4, seed=0).learn(1)
     found = measure(model, 8)
     if measure is sample:
@@ -248,11 +253,11 @@ MODELS_THAT_SHARE_STARTS = {
 }
 
 
-@pytest.mark.parametrize("end", [1, 50])
+@pytest.mark.parametrize("end", [1, 10])
 @pytest.mark.parametrize("name", MODELS_THAT_SHARE_STARTS)
 def test_after_training_the_environments_are_independent_again(name, end):
     """Also where a callback stops the training."""
-    env = make_vec_env("Pendulum-v1", 4, seed=0)
+    env = pendulum(4)
     MODELS_THAT_SHARE_STARTS[name](env).learn(1, At(end) if end > 1 else None)
     assert len(np.unique(env.reset(), axis=0)) == 4
 
@@ -264,10 +269,10 @@ class Unseeded(DummyVecEnv):
 
 @pytest.mark.parametrize("name", MODELS_THAT_SHARE_STARTS)
 def test_a_vec_env_need_not_be_seeded(name):
-    env = Unseeded([lambda: gym.make("Pendulum-v1")] * 4)
+    env = Unseeded([lambda: gym.make("Pendulum-v1", max_episode_steps=20)] * 4)
     model = MODELS_THAT_SHARE_STARTS[name](make_vec_env("Pendulum-v1", 4))
     model.set_env(env)
-    assert model.learn(1).num_timesteps >= 4 * 200
+    assert model.learn(1).num_timesteps >= 4 * 20
     assert landscape(model, n_points=2, n_episodes=1).utilities.shape == (2, 2)
 
 

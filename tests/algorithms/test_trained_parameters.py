@@ -301,7 +301,7 @@ def test_each_pass_of_the_critic_draws_all_steps_in_a_new_order():
     assert first != second and list(range(40)) not in (first, second)
 
 
-def test_no_minibatch_of_the_critic_has_one_step():
+def test_a_last_minibatch_of_one_step_joins_the_one_before():
     kwargs = {"features_extractor_class": Normalized, "share_features_extractor": False, "net_arch": [4]}
     model = make("steps", n_steps=9, batch_size=4, policy_kwargs=kwargs)
     sizes = []

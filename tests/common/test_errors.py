@@ -9,6 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce.diagnostics import check_gradient
+from sb3_reinforce.policies.evaluation import floor_std, set_temperature
 
 NAN = float("nan")
 
@@ -55,8 +56,6 @@ def test_train_needs_a_rollout():
 
 
 def test_temperature_needs_an_action_net_and_min_std_a_log_std():
-    from sb3_reinforce.policies.evaluation import floor_std, set_temperature
-
     with pytest.raises(ValueError, match="action_net"):
         set_temperature(th.nn.Linear(1, 1), 0.5)
     with pytest.raises(ValueError, match="log_std"):

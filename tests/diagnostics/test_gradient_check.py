@@ -169,7 +169,8 @@ def test_images_pass_with_a_bounded_number_of_them(monkeypatch):
 
 def test_gsde_cuts_its_scores_unless_it_learns_features():
     """Stable-Baselines3 detaches the features that the standard deviation depends on: not the gradient of log π."""
-    model = REINFORCE("MlpPolicy", "Pendulum-v1", use_sde=True, device="cpu", seed=0)
+    env = gym.make("Pendulum-v1", max_episode_steps=20)
+    model = REINFORCE("MlpPolicy", env, use_sde=True, device="cpu", seed=0)
     assert check_gradient(model).failures == ["scores"]
     model.policy.action_dist.learn_features = True
     assert check_gradient(model).passed

@@ -29,8 +29,8 @@ def bandit(algorithm=REINFORCE, n_envs=8, **kwargs):
     return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0, **kwargs)
 
 
-@pytest.mark.parametrize("temperature", [1.0, 0.2])
-def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(temperature):
+def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature():
+    temperature = 0.2
     model = bandit(n_envs=40, temperature=temperature)
     utility = CandidateUtility(model, 1000, seed=0)
     thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0 * temperature])
@@ -95,8 +95,6 @@ def test_all_estimators_see_the_same_gradient(algorithm):
     assert table.names == ["likelihood_ratio", "forward", "central", "regression"]
     assert all(row.cosine.high > 0.95 for row in table)
     assert table["likelihood_ratio"].cosine.low > 0.9
-    assert table["likelihood_ratio"].steps == 1
-    assert [table[name].steps >= evaluations for name, evaluations in (("forward", 17), ("central", 32))] == [True] * 2
     assert table["likelihood_ratio"].snr_per_step.low > 0
     assert set(table.legend) == {*table.columns[1:], "[a, b]"}
 

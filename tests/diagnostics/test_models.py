@@ -107,7 +107,7 @@ def test_a_measurement_that_would_cut_a_rollout_is_refused(measure):
     model = REINFORCE("MlpPolicy", Corridor((7,)), n_steps=16, seed=0, device="cpu")
     with pytest.raises(ValueError, match="model is collecting a rollout"):
         model.learn(48, measuring(measure, "step"))
-    assert starts_with_an_episode(model.learn(16).rollout)
+    assert starts_with_an_episode(model.learn(16, reset_num_timesteps=False).rollout)
 
 
 @pytest.mark.parametrize("where", ["rollout_start", "rollout_end"])

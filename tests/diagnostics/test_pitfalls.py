@@ -62,7 +62,7 @@ narrow = {"change": lambda policy: policy.log_std.fill_(-5.0)}
 
 
 TASKS = [
-    ("rate_too_large", "Lower learning_rate (now 1)", "CartPole-v1", 2000, {"learning_rate": 1.0}),
+    ("rate_too_large", "Lower learning_rate (now 1)", "CartPole-v1", 500, {"learning_rate": 1.0}),
     ("unscaled_returns", "VecNormalize", rewarded((5,), lambda t, action: 5e3), 64, {}),
     ("too_few_episodes", "n_episodes", rewarded((4,), noise), 400, whole),
     ("too_few_episodes", "or the number of environments", "CartPole-v1", 2000, {"n_envs": 4, "n_steps": 5}),

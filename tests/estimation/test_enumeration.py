@@ -144,8 +144,11 @@ def test_that_formula_minimizes_the_trace_of_the_covariance(reward_to_go):
     probabilities = th.stack([log_prob_of(trajectory) for trajectory in trajectories]).exp()
     a, s = (th.stack(part) for part in zip(*(episode_terms(t, reward_to_go) for t in trajectories), strict=True))
 
+    model = make_model(reward_to_go=reward_to_go)
+
     def trace(constant):
-        gradients = a - constant * s
+        model.baseline = lambda rollout: th.full_like(rollout.returns, float(constant))
+        gradients = th.stack([estimate(model, [trajectory]).flatten() for trajectory in trajectories])
         return probabilities @ (gradients - probabilities @ gradients).square().sum(1)
 
     best = (probabilities @ (a * s).sum(1)) / (probabilities @ s.square().sum(1))

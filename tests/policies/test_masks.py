@@ -42,11 +42,12 @@ NETWORKS = [{"enable_critic_lstm": False}, {"enable_critic_lstm": False, "shared
 @pytest.mark.parametrize(
     ("algorithm", "task", "kwargs"),
     [
-        *product(ALGORITHMS, ["discrete", "multidiscrete"], [{}]),
+        *product(ALGORITHMS, ["discrete"], [{}]),
+        *product(["reinforce", "search", "ppo", "recurrent"], ["multidiscrete"], [{}]),
         *product(["reinforce", "search", "recurrent"], ["numbers"], [{}]),
         *product(["reinforce", "search", "recurrent"], ["image"], [{"policy_kwargs": SMALL}]),
         *(("recurrent", "discrete", {"policy_kwargs": network}) for network in NETWORKS),
-        *(("reinforce", "multidiscrete", {"temperature": temperature}) for temperature in (1e-3, 0.5, 1e6)),
+        *(("reinforce", "multidiscrete", {"temperature": temperature}) for temperature in (1e-3, 1e6)),
     ],
 )
 def test_no_forbidden_action_is_taken(algorithm, task, kwargs):

@@ -162,8 +162,8 @@ def divergences_of(model, total_timesteps):
 def test_the_measured_divergence_is_the_target(env_id, target_kl):
     env = make_vec_env(env_id, 8, seed=0)
     model = REINFORCE("MlpPolicy", env, step="natural", target_kl=target_kl, n_steps=128, seed=0)
-    found = divergences_of(model, 8 * 1024)
-    assert len(found) == 8
+    found = divergences_of(model, 4 * 1024)
+    assert len(found) == 4
     np.testing.assert_allclose(found, target_kl or 0.01, rtol=0.2)
 
 
@@ -177,7 +177,6 @@ MODELS = {
     "Discrete": ("MlpPolicy", sums(spaces.Discrete(3, start=1)), {}),
     "MultiDiscrete": ("MlpPolicy", sums(spaces.MultiDiscrete([2, 3])), {}),
     "MultiBinary": ("MlpPolicy", sums(spaces.MultiBinary(4)), {}),
-    "Box": ("MlpPolicy", sums(BOX), {}),
     "gSDE": ("MlpPolicy", sums(BOX), {"use_sde": True}),
     "squashed": ("MlpPolicy", sums(BOX), {"use_sde": True, "policy_kwargs": {"squash_output": True}}),
     "images": ("CnnPolicy", FakeImageEnv(screen_height=40, screen_width=40), {}),

@@ -68,7 +68,7 @@ class OwnForward(ActorCriticPolicy):
         return super().forward(obs, deterministic)
 
 
-@pytest.mark.parametrize("space", SPACES, ids=str)
+@pytest.mark.parametrize("space", (SPACES[0], SPACES[3]), ids=str)
 def test_a_run_does_not_depend_on_the_path(space):
     ends = []
     for policy in ("MlpPolicy", OwnForward):
@@ -128,12 +128,12 @@ def test_a_policy_that_is_not_plain_acts_by_its_own_methods():
         *product(("forward_hook",), ("", "mlp_extractor", f"{EXTRACTOR}.flatten"), (8,)),
     ],
 )
-def test_hooks_are_called_as_in_a2c(register, module, least):
+def test_hooks_are_called_at_each_step_and_in_each_backward_pass(register, module, least):
     """Users log gradients with them."""
     model, calls = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu"), []
-    getattr(model.policy.get_submodule(module), f"register_{register}")(lambda *args: calls.append(1))
+    getattr(model.policy.get_submodule(module), f"register_{register}")(lambda *args: calls.append(model.is_collecting))
     model.learn(8)
-    assert len(calls) >= least
+    assert calls.count(register == "forward_hook") >= least
 
 
 OFFSET = th.tensor([-100.0, 100.0])
