@@ -6,7 +6,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 
 def run(path: str) -> None:
-    print(path, flush=True)
+    print(path)
     runpy.run_path(path, run_name="__main__")
     # Otherwise the lines of the two processes alternate
     sys.stdout.flush()

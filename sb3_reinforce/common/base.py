@@ -129,7 +129,7 @@ class BasePolicyGradient(Distributed):
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
 
         :param path: The file, to which ``.zip`` is added where it has no suffix; under torchrun process 0 writes it
-        :param exclude: Attributes not to save, besides those that never are
+        :param exclude: Attributes not to save, besides those that never are; not the one that ``load`` needs
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written
         """

@@ -131,10 +131,10 @@ class PitfallCallback(Diagnosis):
 
     Where several pitfalls have one cause, only the cause is reported.
 
-    The pitfalls: a learning rate that is too large, or too small for the number of updates, returns that are not
-    scaled, too few episodes, the total return, gradients that spike without clipping, a critic that explains hardly
-    anything, a policy that is deterministic too early, and episodes that are cut. They are detected from what training
-    computes anyway; the cost is two forward passes and a backward pass of the actor over each rollout. Training is not
+    The pitfalls: a learning rate that is too large; one that is too small for the number of updates; returns that are
+    not scaled; too few episodes; the total return; gradients that spike without clipping; a critic that explains hardly
+    anything; a policy that is deterministic too early; episodes that are cut. They are detected from what training
+    computes anyway. The cost is two forward passes and a backward pass of the actor over each rollout. Training is not
     changed.
 
     A FiniteDifference is refused: it has no returns that weight scores.
@@ -155,7 +155,6 @@ class PitfallCallback(Diagnosis):
         self.found: dict[str, str] = {}
         self.updates: deque[Update] = deque(maxlen=50)
         self.n_updates = 0
-        self.path = 0.0
         self.rollout: Rollout | None = None
 
     def _on_rollout_end(self) -> None:
@@ -176,8 +175,14 @@ class PitfallCallback(Diagnosis):
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
         leave_no_graph(policy, *first_step(rollout))
 
+    def _on_training_start(self) -> None:
+        self.path = 0.0
+        self.n_moves = 0
+
     def _on_rollout_start(self) -> None:
         self._examine()
+        if self.n_moves == 0:
+            self.first_timestep = self.num_timesteps
 
     def _on_training_end(self) -> None:
         self._examine()
@@ -190,9 +195,14 @@ class PitfallCallback(Diagnosis):
         self.updates.append(update)
         self.n_updates += 1
         self.path += math.sqrt(2 * max(update.kl, 0.0))
+        if update.kl != 0:
+            self.n_moves += 1
         self.rollout = None
-        progress_remaining = 1.0 - min(1.0, self.num_timesteps / self.locals["total_timesteps"])
-        history = History(self.model, list(self.updates), self.n_updates, self.path, progress_remaining)
+        total_timesteps = self.locals["total_timesteps"]
+        progress_remaining = 1.0 - min(1.0, self.num_timesteps / total_timesteps)
+        share = min(1.0, (self.num_timesteps - self.first_timestep) / max(1, total_timesteps - self.first_timestep))
+        movement = self.path, self.n_moves, share
+        history = History(self.model, list(self.updates), self.n_updates, progress_remaining, *movement)
         for name, pitfall in PITFALLS.items():
             is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
             sentence = None if name in self.found or is_explained else pitfall(history)

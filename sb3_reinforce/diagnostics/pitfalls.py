@@ -44,8 +44,10 @@ class History:
     model: REINFORCE
     updates: list[Update]  # the last ones, at most 50
     n_updates: int
-    path: float  # Σ √(2 KL) over all updates
     progress_remaining: float  # from 1 to 0
+    path: float  # Σ √(2 KL) over the updates of this call of learn
+    n_moves: int  # how many of these changed the policy
+    share: float  # of this call since the first change, from 0 to 1
 
 
 Pitfall: TypeAlias = Callable[[History], str | None]
@@ -94,22 +96,21 @@ def rate_too_large(history: History) -> str | None:
 
 def rate_too_small(history: History) -> str | None:
     """
-    A path ``Σ √(2 KL)`` that, at the rate of the first half, stays below 0.3 in the whole training.
+    After half of the training, steps ``√(2 KL)`` below 0.01 on average, whose sum will stay below 0.3 at this rate.
 
-    Even if all steps have one direction, the policy ends at a KL divergence of ``path² / 2``, 0.045, from its start.
+    If all steps have one direction, the policy ends at a KL divergence of about ``path² / 2``, 0.045, from its start;
+    otherwise it ends nearer.
     """
-    left = history.progress_remaining
+    is_slow = history.path < min(0.3 * history.share, 0.01 * history.n_moves)
+    if history.n_moves < 5 or history.share <= 0.5 or not is_slow:
+        return None
     argument, value = step_bound(history)
-    # A rate of 0 is meant, as where the critic warms up
-    can_move = value > 0 and any(update.grad_norm > 0 for update in history.updates)
-    if can_move and left < 0.5 and history.n_updates >= 10 and history.path < 0.3 * (1 - left):
-        size = "n_episodes" if history.model.n_steps is None else "n_steps"
-        return (
-            f"The policy hardly changes: {history.n_updates} updates, in {1 - left:.0%} of the training, moved it by a "
-            f"KL divergence of at most {history.path**2 / 2:.2g}. Raise {argument} (now {value:.2g}), or lower {size} "
-            f"(now {getattr(history.model, size)}), which gives more updates"
-        )
-    return None
+    n_steps = history.model.n_steps if history.model.step == "optimizer" else None
+    more_updates = "" if n_steps is None else f", or lower n_steps (now {n_steps}) for more updates"
+    return (
+        f"The policy hardly changes: {history.n_moves} updates, in {history.share:.0%} of the training, moved it by a "
+        f"KL divergence of at most about {history.path**2 / 2:.2g}. Raise {argument} (now {value:.2g}){more_updates}"
+    )
 
 
 def unscaled_returns(history: History) -> str | None:
@@ -237,6 +238,7 @@ PITFALLS: dict[str, Pitfall] = {
 # A pitfall is not reported after one of its causes. The policy's learning rate is by default the critic's too
 CAUSES = {
     "deterministic_too_early": {"rate_too_large"},
+    "rate_too_small": {"rate_too_large", "deterministic_too_early"},
     "too_few_episodes": {"rate_too_large", "deterministic_too_early"},
-    "useless_critic": {"rate_too_large", "unscaled_returns"},
+    "useless_critic": {"rate_too_large", "rate_too_small", "unscaled_returns"},
 }

@@ -74,8 +74,10 @@ class Experiment(exp_manager.ExperimentManager):
             is_unsupported = (isinstance(error, AssertionError) and str(error)) or UNFIT.match(str(error))
             if not (is_unsupported or self.argument_names & named):
                 raise
-            is_from_file = allowed_keys(self.algo) & named and self.trial_id is None
-            source = f" (settings without -params are from {self.model_config or self.config})" if is_from_file else ""
+            source = ""
+            in_files = self.argument_names - ZOO_ARGUMENTS - {"observation_space", "action_space"}
+            if in_files & named and self.trial_id is None:
+                source = f" (settings that -params does not give are from {self.model_config or self.config})"
             raise ConfigurationError(f"{error}{source}") from error
 
     def learn(self, model: BaseAlgorithm) -> None:

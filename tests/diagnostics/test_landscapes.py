@@ -132,7 +132,8 @@ def test_a_landscape_rises_along_the_gradient():
     gradient = likelihood_ratio(model, 200)[0].mean(0)
     across = th.tensor([1.0, 1.0, 0.0, 0.0], dtype=th.float64)
     found = landscape(model, {"ĝ": gradient}, th.stack([gradient, across]), extent=3.0, n_points=5, n_episodes=60)
-    assert f" to {found.utilities.max():.4g} at 5 x 5 points, 60 episodes each" in str(found)
+    span = f"{found.utilities.min():.4g} to {found.utilities.max():.4g}"
+    assert str(found) == f"Utilities from {span} at 5 x 5 points, 60 episodes each; plot_landscape draws them"
     assert found.utilities.shape == (5, 5)
     assert (found.utilities[:, -1] > found.utilities[:, 0]).all()
     assert np.ptp(found.utilities.mean(axis=1)) < 0.2

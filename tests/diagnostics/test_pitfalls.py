@@ -91,17 +91,17 @@ HEALTHY = dict(kl=0.01, randomness=0.9, grad_norm=1.0, explained_variance=0.5, r
 HEALTHY |= dict(target_scale=10.0, target_std=5.0, n_episodes=16, n_steps=256, used_fraction=1.0, temperature=1.0)
 
 
-def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, path=10.0, **kwargs):
+def seen(*updates, n=1, progress=1.0, signal=0.0, n_updates=100, path=10.0, n_moves=100, **kwargs):
     """What ``history`` makes a history of: n times these updates, of a model with these arguments."""
-    return updates * n, progress, signal, n_updates, path, kwargs
+    return updates * n, progress, signal, n_updates, path, n_moves, kwargs
 
 
-def history(updates, progress, signal, n_updates, path, kwargs):
+def history(updates, progress, signal, n_updates, path, n_moves, kwargs):
     """Updates that are healthy but for the figures given, whose gradients have a signal-to-noise ratio."""
     model = REINFORCE("MlpPolicy", "CartPole-v1", device="cpu", **kwargs)
     gradients = th.randn(len(updates), 30, generator=th.Generator().manual_seed(0)) + signal**0.5
     made = [Update(gradient=g, **{**HEALTHY, **figures}) for g, figures in zip(gradients, updates, strict=True)]
-    return History(model, made, n_updates, path, progress)
+    return History(model, made, n_updates, progress, path, n_moves, share=1 - progress)
 
 
 few = {"n_episodes": 4}
@@ -130,9 +130,8 @@ free = {"max_grad_norm": None}
         ("rate_too_small", seen({}, path=0.15, **late), seen({}, path=0.16, **late)),
         ("rate_too_small", seen({}, path=0.15, **late), seen({}, path=math.nan, **late)),
         ("rate_too_small", seen({}, path=0.1, **late), seen({}, path=0.1, progress=0.5)),
-        ("rate_too_small", seen({}, path=0.1, n_updates=10, **late), seen({}, path=0.1, n_updates=9, **late)),
-        ("rate_too_small", seen({}, path=0.1, **late), seen({"grad_norm": 0.0}, path=0.1, **late)),
-        ("rate_too_small", seen({}, path=0.1, **late), seen({}, path=0.1, learning_rate=0.0, **late)),
+        ("rate_too_small", seen({}, path=0.09, n_moves=10, **late), seen({}, path=0.11, n_moves=10, **late)),
+        ("rate_too_small", seen({}, path=0.03, n_moves=5, **late), seen({}, path=0.03, n_moves=4, **late)),
         ("unscaled_returns", seen(large), seen({"return_scale": 999.0})),
         ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
         ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
@@ -160,11 +159,16 @@ def test_a_pitfall_starts_at_its_threshold(name, falls, stays):
 
 
 @pytest.mark.parametrize(
-    ("name", "case"), [("rate_too_large", seen({"kl": 1.5})), ("deterministic_too_early", seen(fixed))]
+    ("name", "case"),
+    [
+        ("rate_too_large", seen({"kl": 1.5})),
+        ("rate_too_small", seen({}, path=0.1, **late)),
+        ("deterministic_too_early", seen(fixed)),
+    ],
 )
-def test_the_natural_step_is_shortened_by_its_target(name, case):
-    sentence = PITFALLS[name](history(*case[:5], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
-    assert "ower target_kl" in sentence and "learning_rate" not in sentence
+def test_the_natural_step_has_its_target_for_a_rate(name, case):
+    sentence = PITFALLS[name](history(*case[:-1], {"step": "natural", "target_kl": lambda progress: 2 * progress}))
+    assert "target_kl" in sentence and "learning_rate" not in sentence and "n_steps" not in sentence
 
 
 def test_a_collapse_counts_the_updates_whose_divergence_is_unknown():
@@ -180,6 +184,7 @@ def test_a_spike_does_not_lengthen_the_natural_step():
 
 def test_of_several_pitfalls_with_one_cause_the_cause_is_reported():
     assert set(fall("CartPole-v1", 4000, learning_rate=1.0)) == {"rate_too_large"}
+    assert set(fall(rewarded((4,)), 640, **one_action)) == {"deterministic_too_early"}
 
 
 def test_a_negative_signal_to_noise_ratio_is_not_a_number_for_a_reader():
@@ -283,6 +288,19 @@ def healthy(env, timesteps, n_envs=8, normalize=False, **kwargs):
 def test_nothing_is_said_of_a_healthy_run(cartpole, pendulum):
     assert healthy("CartPole-v1", cartpole) == healthy("CartPole-v1", cartpole, n_envs=4) == ({}, 0)
     assert healthy("Pendulum-v1", pendulum, normalize=True, gamma=0.9) == ({}, 0)
+
+
+def test_a_training_counts_from_its_first_change_of_the_policy():
+    """Neither updates in which only the critic learns count, nor those before a run was resumed."""
+    kwargs = {"n_steps": 16, "critic_learning_rate": 2e-3, "seed": 0, "device": "cpu"}
+    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 8, seed=0), learning_rate=0.0, **kwargs)
+    callback = PitfallCallback()
+    model.learn(10 * 128, callback)
+    model.learning_rate = 2e-3
+    model.learn(10 * 128, callback, reset_num_timesteps=False)
+    assert callback.found == {} and callback.n_moves == 10
+    model.learn(10 * 128, callback := PitfallCallback(), reset_num_timesteps=False)
+    assert callback.found == {} and callback.n_moves == 10
 
 
 @pytest.mark.slow
