@@ -201,8 +201,8 @@ class PitfallCallback(Diagnosis):
         total_timesteps = self.locals["total_timesteps"]
         progress_remaining = 1.0 - min(1.0, self.num_timesteps / total_timesteps)
         share = min(1.0, (self.num_timesteps - self.first_timestep) / max(1, total_timesteps - self.first_timestep))
-        movement = self.path, self.n_moves, share
-        history = History(self.model, list(self.updates), self.n_updates, progress_remaining, *movement)
+        updates = list(self.updates)
+        history = History(self.model, updates, self.n_updates, progress_remaining, self.path, self.n_moves, share)
         for name, pitfall in PITFALLS.items():
             is_explained = not CAUSES.get(name, set()).isdisjoint(self.found)
             sentence = None if name in self.found or is_explained else pitfall(history)
