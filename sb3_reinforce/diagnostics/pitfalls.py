@@ -102,7 +102,8 @@ def rate_too_small(history: History) -> str | None:
     otherwise it ends nearer.
     """
     is_slow = history.path < min(0.3 * history.share, 0.01 * history.n_moves)
-    if history.n_moves < 5 or history.share <= 0.5 or not is_slow:
+    # A run of a few updates is a trial
+    if history.n_moves < 10 or history.share <= 0.5 or not is_slow:
         return None
     argument, value = step_bound(history)
     n_steps = history.model.n_steps if history.model.step == "optimizer" else None

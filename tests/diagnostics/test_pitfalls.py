@@ -131,7 +131,7 @@ free = {"max_grad_norm": None}
         ("rate_too_small", seen({}, path=0.15, **late), seen({}, path=math.nan, **late)),
         ("rate_too_small", seen({}, path=0.1, **late), seen({}, path=0.1, progress=0.5)),
         ("rate_too_small", seen({}, path=0.09, n_moves=10, **late), seen({}, path=0.11, n_moves=10, **late)),
-        ("rate_too_small", seen({}, path=0.03, n_moves=5, **late), seen({}, path=0.03, n_moves=4, **late)),
+        ("rate_too_small", seen({}, path=0.03, n_moves=10, **late), seen({}, path=0.03, n_moves=9, **late)),
         ("unscaled_returns", seen(large), seen({"return_scale": 999.0})),
         ("unscaled_returns", seen(large), seen(large, normalize_advantage=True)),
         ("unscaled_returns", seen(large, step="natural"), seen(large, step="natural", baseline="mean")),
