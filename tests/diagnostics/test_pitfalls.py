@@ -290,17 +290,21 @@ def test_nothing_is_said_of_a_healthy_run(cartpole, pendulum):
     assert healthy("Pendulum-v1", pendulum, normalize=True, gamma=0.9) == ({}, 0)
 
 
-def test_a_training_counts_from_its_first_change_of_the_policy():
-    """Neither updates in which only the critic learns count, nor those before a run was resumed."""
-    kwargs = {"n_steps": 16, "critic_learning_rate": 2e-3, "seed": 0, "device": "cpu"}
-    model = REINFORCE("MlpPolicy", make_vec_env("CartPole-v1", 8, seed=0), learning_rate=0.0, **kwargs)
+def test_a_training_counts_from_its_first_change_of_the_policy(monkeypatch):
+    """Neither updates in which only the critic learns count, nor those of earlier calls of learn."""
+    found = []
+    record = {"record": lambda history: found.append((history.n_moves, round(history.share, 9)))}
+    monkeypatch.setattr("sb3_reinforce.diagnostics.callbacks.PITFALLS", record)
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    model = REINFORCE("MlpPolicy", env, n_steps=16, learning_rate=0.0, critic_learning_rate=2e-3, device="cpu")
     callback = PitfallCallback()
-    model.learn(10 * 128, callback)
+    model.learn(4 * 32, callback)
+    assert [n_moves for n_moves, _ in found] == [0] * 4
     model.learning_rate = 2e-3
-    model.learn(10 * 128, callback, reset_num_timesteps=False)
-    assert callback.found == {} and callback.n_moves == 10
-    model.learn(10 * 128, callback := PitfallCallback(), reset_num_timesteps=False)
-    assert callback.found == {} and callback.n_moves == 10
+    for each in (callback, callback, PitfallCallback()):
+        found.clear()
+        model.learn(4 * 32, each, reset_num_timesteps=False)
+        assert found == [(1, 0.25), (2, 0.5), (3, 0.75), (4, 1.0)]
 
 
 @pytest.mark.slow
