@@ -38,7 +38,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        write(env, i, obs)
+        write_observation(env, i, obs)
         infos.append(info)
     env.buf_infos = infos
     return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
@@ -49,13 +49,13 @@ def reset(env: DummyVecEnv) -> VecEnvObs:
     for i, single in enumerate(env.envs):
         options = {"options": env._options[i]} if env._options[i] else {}
         obs, env.reset_infos[i] = single.reset(seed=env._seeds[i], **options)
-        write(env, i, obs)
+        write_observation(env, i, obs)
     env._reset_seeds()
     env._reset_options()
     return copy_observations(env)
 
 
-def write(env: DummyVecEnv, i: int, obs: Any) -> None:
+def write_observation(env: DummyVecEnv, i: int, obs: Any) -> None:
     """Check the observation of environment ``i`` and write it into the buffers."""
     check_observation(env.observation_space, obs, i)
     for key, part in env.buf_obs.items():

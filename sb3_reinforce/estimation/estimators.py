@@ -34,7 +34,7 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
     """
     deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = evaluate(utility, th.cat([theta[None], theta + deltas]))
+    utilities = evaluate_utility(utility, th.cat([theta[None], theta + deltas]))
     return solve(deltas, utilities[1:] - utilities[0])
 
 
@@ -54,7 +54,7 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     """
     deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
-    utilities = evaluate(utility, th.stack([theta + deltas, theta - deltas]))
+    utilities = evaluate_utility(utility, th.stack([theta + deltas, theta - deltas]))
     top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
     plus, minus = utilities[:, top]
     return solve(2 * deltas[top], plus - minus)
@@ -78,7 +78,7 @@ def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -
     deltas = check_deltas(theta, deltas)
     design = deltas - deltas.mean(0)
     check_design(design, deltas)
-    utilities = evaluate(utility, theta + deltas)
+    utilities = evaluate_utility(utility, theta + deltas)
     return solve(design, utilities - utilities.mean())
 
 
@@ -89,7 +89,7 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def evaluate(utility: Utility, candidates: th.Tensor) -> th.Tensor:
+def evaluate_utility(utility: Utility, candidates: th.Tensor) -> th.Tensor:
     """The utilities of candidates, one for each row."""
     return check_tensor("utility", utility(candidates), candidates.shape[:-1]).to(candidates)
 

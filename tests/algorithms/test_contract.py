@@ -60,16 +60,8 @@ def make_for_spaces(kind, env, policy):
     return RecurrentREINFORCE(policy, env, n_episodes=2, policy_kwargs=small, seed=0, device="cpu")
 
 
-# A memory does not take MultiDiscrete observations
-SPACES_OF_KINDS = [
-    (kind, *case)
-    for kind in (*KINDS, "recurrent")
-    for case in SPACES
-    if kind != "recurrent" or not isinstance(case[0], spaces.MultiDiscrete)
-]
-
-
-@pytest.mark.parametrize(("kind", "observation_space", "action_space", "policy"), SPACES_OF_KINDS, ids=str)
+@pytest.mark.parametrize("kind", [*KINDS, "recurrent"])
+@pytest.mark.parametrize(("observation_space", "action_space", "policy"), SPACES, ids=str)
 def test_spaces(kind, observation_space, action_space, policy):
     """In training and in ``predict``; the stored actions of discrete spaces count from 0."""
     env = make_vec_env(lambda: Random(observation_space, action_space), 2, seed=0)

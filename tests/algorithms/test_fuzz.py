@@ -1,14 +1,16 @@
 """
-Random configurations: each trains, stays finite and counts exactly.
+Random configurations: valid ones train, stay finite and count exactly, and invalid ones are named.
 
-``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand of each instead of twenty-five.
+``FUZZ_EXAMPLES=10000 pytest tests/algorithms/test_fuzz.py`` tries ten thousand valid ones of each instead of
+twenty-five.
 """
 
 import os
 import warnings
 
 import numpy as np
-from environments import Random
+import pytest
+from environments import Corridor, Random
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -178,3 +180,23 @@ def test_valid_reinforce(run):
 @given(environments(), searches())
 def test_valid_search(env, arguments):
     assert_trains(FiniteDifference, env, arguments)
+
+
+ODD = ["x", None, [1], float("nan"), float("inf"), -float("inf"), True, 1j, b"mean", object(), -1, 0, {}, ()]
+# Greater numbers of steps are valid, and take long
+numbers = st.one_of(st.integers(max_value=20), st.floats())
+anything = st.one_of(st.sampled_from(ODD), numbers, st.text(max_size=3))
+
+
+@pytest.mark.filterwarnings(r"ignore:n_delta=\d+ perturbations do not determine")
+@pytest.mark.parametrize("algorithm", TABLES)
+@settings(fuzzed, max_examples=4 * N_EXAMPLES)
+@given(data=st.data())
+def test_a_random_value_trains_or_is_named(algorithm, data):
+    name = data.draw(st.sampled_from(sorted(TABLES[algorithm].keys() - {"tensorboard_log"})))
+    value = data.draw(st.one_of(anything, anything.map(lambda value: lambda *args: value)))
+    env = Monitor(Corridor((2, 3)))
+    try:
+        algorithm(**{"policy": "MlpPolicy", "env": env, "device": "cpu", name: value}).learn(1)
+    except (TypeError, ValueError) as error:
+        assert name in str(error)

@@ -34,7 +34,7 @@ def test_to_repeat_the_observation(env_class, baseline):
 
 
 def stop_at_490(eval_env, eval_freq):
-    """As ``examples/1_reinforce.py``: stop once 20 episodes score 490."""
+    """Stop once 20 episodes score 490."""
     stop = StopTrainingOnRewardThreshold(reward_threshold=490, verbose=0)
     return EvalCallback(eval_env, callback_on_new_best=stop, n_eval_episodes=20, eval_freq=eval_freq, verbose=0)
 
@@ -43,7 +43,6 @@ def score(model, seed):
     return evaluate_policy(model, make_vec_env("CartPole-v1", 5, seed=2000 + seed), n_eval_episodes=100)[0]
 
 
-# ``examples/1_reinforce.py``, which CI runs, asserts the same for one seed
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_cart_pole_is_solved(seed):

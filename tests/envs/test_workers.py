@@ -56,8 +56,12 @@ FAULTS = {
     "die in reset": KILLED,
     "between two steps": KILLED,
 }
-# Workers that are not forked import PyTorch, which takes seconds: one case of Stable-Baselines3's default
-DEATHS = [*itertools.product(["episodes", "search"], ["fork"], FAULTS), ("search", "forkserver", "die in step")]
+# Workers that are not forked import PyTorch, which takes seconds: one case of each start method
+DEATHS = [
+    *itertools.product(["episodes", "search"], ["fork"], FAULTS),
+    ("search", "forkserver", "die in step"),
+    pytest.param("episodes", "spawn", "raise in step", marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize(("kind", "start_method", "fault"), DEATHS)

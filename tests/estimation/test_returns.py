@@ -12,6 +12,11 @@ from sb3_reinforce.estimation.rollout import timesteps_of
 N_STEPS, N_ENVS = 37, 3
 
 
+def test_rewards_to_go_by_hand():
+    rewards, dones = np.array([[1.0, 3.0, 2.0]]).T, np.array([[False, False, True]]).T
+    assert reward_to_go(rewards, dones, gamma=1.0)[:, 0].tolist() == [6, 5, 2]
+
+
 @pytest.fixture
 def rollout():
     rng = np.random.default_rng(0)

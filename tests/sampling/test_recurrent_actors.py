@@ -18,17 +18,17 @@ def recorded(actor):
     """Actions, log π and states over random observations and starts of episodes."""
     rng = np.random.default_rng(0)
     th.manual_seed(1)
-    obs = rng.normal(size=(60, 3, 5)).astype(np.float32)
-    starts = rng.random((60, 3)) < 0.1
+    obs = rng.normal(size=(200, 3, 5)).astype(np.float32)
+    starts = rng.random((200, 3)) < 0.1
     actions, states, log_probs = [], [], []
-    for t in range(60):
+    for t in range(200):
         actor.starts = lambda t=t: starts[t]
         action, _, log_prob = actor.act(obs[t])
         actions.append(action)
         log_probs.append(log_prob)
         states.append(actor.state())
     if log_probs[0] is None:
-        log_probs = actor.log_prob(np.array(actions).reshape(60, 3, -1))
+        log_probs = actor.log_prob(np.array(actions).reshape(200, 3, -1))
     return obs, starts, np.array(actions), th.stack(states), np.ravel(log_probs)
 
 

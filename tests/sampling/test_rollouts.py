@@ -53,13 +53,13 @@ def test_a_monitor_may_refuse_the_reset_that_whole_episodes_begin_with():
 
 
 def test_lengths_of_used_episodes_are_drawn_without_bias():
-    """Lengths of 1 and 30: "the first to finish" would use far more short ones than half."""
-    model = make_model(lambda: Corridor((1, 30)), 4, n_episodes=6, baseline="none", learning_rate=0.0)
+    """Lengths of 1 and 100: "the first to finish" would use far more short ones than half."""
+    model = make_model(lambda: Corridor((1, 100)), 4, n_episodes=6, baseline="none", learning_rate=0.0)
     n_used = Record(lambda model: model.rollout.used.sum().item())
-    model.learn(20_000, callback=n_used)
+    model.learn(40_000, callback=n_used)
     n_episodes = 6 * len(n_used.records)
-    mean, std = 15.5, 14.5
-    assert n_episodes > 500
+    mean, std = 50.5, 49.5
+    assert n_episodes > 300
     assert abs(sum(n_used.records) / n_episodes - mean) < 3 * std / np.sqrt(n_episodes)
 
 
