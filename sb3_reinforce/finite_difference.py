@@ -24,6 +24,7 @@ from sb3_reinforce.common.settings import (
     check_learn,
     check_named,
 )
+from sb3_reinforce.common.tensors import ROUNDING
 from sb3_reinforce.envs.guards import guarded
 from sb3_reinforce.estimation.estimators import (
     ESTIMATORS,
@@ -41,7 +42,6 @@ from sb3_reinforce.estimation.perturbations import (
     new_generator,
     sample_deltas,
 )
-from sb3_reinforce.estimation.weights import ROUNDING
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy

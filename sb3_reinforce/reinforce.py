@@ -66,13 +66,14 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
-    (Williams, 1992, equation 4 and theorems 1 and 2; γ^t only with ``discount_scores``). m_t is 1 for the steps that
-    are used: those whose return is known and, with ``n_episodes``, in an episode of the quota. The denominator is
-    ``n_steps * n_envs`` for fixed rollouts; for whole episodes see ``normalize_by``. With ``baseline="none"``,
-    ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``, ``normalize_by="episodes"``, ``discount_scores=True``,
-    ``ent_coef=0`` and neither normalized advantages nor clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its
-    steps share noise, and Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout,
-    batch normalization and noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
+    (Williams, 1992, section 5 and theorem 2, for the total return; Sutton et al., 2000, for G_t; γ^t only with
+    ``discount_scores``). m_t is 1 for the steps that are used: those whose return is known and, with ``n_episodes``, in
+    an episode of the quota. The denominator is ``n_steps * n_envs`` for fixed rollouts; for whole episodes see
+    ``normalize_by``. With ``baseline="none"``, ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``,
+    ``normalize_by="episodes"``, ``discount_scores=True``, ``ent_coef=0`` and neither normalized advantages nor
+    clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
+    gradient where the noise depends on the features. So are dropout, batch normalization and noisy layers, with which
+    the policy that is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -109,13 +110,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
-    :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of steps used (biased: a ratio of
-        two random numbers), or ``"episodes"``, their number (unbiased)
+    :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of steps used (a direction that is
+        biased where lengths differ), or ``"episodes"``, their number (unbiased)
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
-    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. A
-        schedule that falls to 0 ends with an almost deterministic policy, which is how policies are evaluated
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. If it
+        falls to 0, training ends with nearly the deterministic policy that ``evaluate_policy`` measures by default
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor. It can be a schedule: if it falls to 0, the policy explores at first, and its
         noise may shrink later
@@ -444,7 +445,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         with_values = trains_values or (batch.values is not None and calls(self.policy, "evaluate_actions", True))
         log_prob, entropy, values = evaluate(self.policy, batch.observations, batch.actions, with_values)
         # L = −Σ_t [w_t log π(a_t|s_t) + ent_coef · H(π(·|s_t))] / D: the first term has the gradient −ĝ
-        # (Williams, 1992, equation 4)
+        # (Williams, 1992, section 5)
         policy_loss = -(batch.weights * log_prob).sum() / rollout.denominator
         loss = policy_loss - ent_coef * entropy.sum() / rollout.denominator
         if trains_values and values is not None:

@@ -18,7 +18,7 @@ Check: TypeAlias = Callable[[str, Any], Any]
 # A bound that leaves out infinity
 MAX = sys.float_info.max
 # Larger than the rounding errors of schedules
-ROUNDING = 1e-12
+SCHEDULE_ROUNDING = 1e-12
 
 
 def check_kind(name: str, value: Any, kinds: tuple[Any, ...], allowed: str = "") -> Any:
@@ -118,7 +118,7 @@ class CheckedSchedule(FloatSchedule):
     def __call__(self, progress_remaining: float) -> float:
         value: Any = self.value_schedule(progress_remaining)
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
-        if isinstance(value, float) and -ROUNDING < value < 0:
+        if isinstance(value, float) and -SCHEDULE_ROUNDING < value < 0:
             # A LinearSchedule that ends at 0 may end below it by rounding
             value = 0.0
         # At the end of training nothing is drawn any more

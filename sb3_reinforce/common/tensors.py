@@ -6,6 +6,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 
+# Differences up to this fraction of the numbers are rounding errors
+ROUNDING = 1e-12
 # A tensor, or a nested dict of tensors
 TensorOrDict: TypeAlias = Any
 

@@ -179,7 +179,7 @@ def componentwise_residuals(weighted: th.Tensor, scores: th.Tensor) -> th.Tensor
     ``A_ik − b_k S_ik`` (m, n) with the constant of least variance ``b_k = Cov(A_k, S_k) / Var(S_k)`` for component k.
 
     Peters and Schaal (2008), section 3.2, with sample covariances for E[A S] and E[S²], as E[S] = 0. Fitted to the
-    episodes that it is applied to, the variance is too small by about 1/m.
+    episodes that it is applied to, the variance is too small by a share of about 1/m.
     """
     centered = scores - scores.mean(0)
     squares = centered.square().sum(0)

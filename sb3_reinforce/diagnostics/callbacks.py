@@ -4,12 +4,11 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Iterable
-from typing import cast
 
 import torch as th
 
 from sb3_reinforce.common.arguments import check_integer
-from sb3_reinforce.common.tensors import select, to_vector
+from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.diagnostics.baseline_comparison import check_critic, functions_of, weights_by
 from sb3_reinforce.diagnostics.diagnosis import Diagnosis
 from sb3_reinforce.diagnostics.pitfalls import CAUSES, PITFALLS, History, Update
@@ -17,12 +16,17 @@ from sb3_reinforce.diagnostics.randomness import randomness
 from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, training_weights
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
-from sb3_reinforce.estimation.rollout import Rollout, used_inputs
+from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.scores import first_step, gradient_blocks, parameters_of
-from sb3_reinforce.estimation.weights import by_step
+from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.finite_difference import FiniteDifference
-from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph, log_prob_of, temperature_of
-from sb3_reinforce.policies.parameters import evaluation_mode
+from sb3_reinforce.policies.evaluation import (
+    actor_parameters,
+    evaluation_mode,
+    leave_no_graph,
+    log_prob_of,
+    temperature_of,
+)
 
 
 class GradientQualityCallback(Diagnosis):
@@ -43,9 +47,10 @@ class GradientQualityCallback(Diagnosis):
 
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
     rollout and are noisy if it has few episodes. With fewer than two only the cosine is logged, and while the actor is
-    frozen nothing. A measurement costs about one forward and 1 + (number of baselines) backward passes over at most
-    ``max_episodes`` episodes, two more with ``"optimal"``, and the same again for every 256 MiB that the gradients
-    take. Nothing is sampled for it, and training is the same with and without it.
+    frozen nothing. A measurement costs about one forward and one backward pass over at most ``max_episodes`` episodes
+    for an ``MlpPolicy``, two more with ``"optimal"``, and the same again for every 256 MiB that the gradients take. For
+    other policies it costs a backward pass for each episode and each baseline. Nothing is sampled for it, and training
+    is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
@@ -83,13 +88,14 @@ class GradientQualityCallback(Diagnosis):
         self.n_rollouts += 1
         n_left = -self.n_rollouts % self.every
         if n_left > 2:
-            # A cosine needs the parameters before the last three updates
+            # A cosine needs the parameters at the ends of three rollouts in a row
             return
         is_search = isinstance(self.model, FiniteDifference)
         try:
             theta = self.model.theta if is_search else to_vector(parameters_of(self.model.rollout))
         except ValueError:
             # The actor is frozen
+            self.thetas.clear()
             return
         if self.thetas and self.thetas[-1].shape != theta.shape:
             self.thetas.clear()
@@ -117,8 +123,8 @@ class GradientQualityCallback(Diagnosis):
         own_weights = training_weights(self.model)
         rollout = evenly_spread(rollout, self.max_episodes)
         weights = [own_weights, *(weights_by(function, rollout) for function in self.functions.values())]
-        grams = sum(th.stack([gram(g) for g in block]) for block in gradient_blocks(rollout, *weights))
-        own, *others = map(compute_moments, cast(th.Tensor, grams))
+        grams = [th.stack([gram(g) for g in block]) for block in gradient_blocks(rollout, *weights)]
+        own, *others = map(compute_moments, th.stack(grams).sum(0))
         figures = {"snr": n_episodes * float(signal_to_noise(own)), "noise_scale": float(noise_scale(own))}
         for name, moments in zip(self.functions, others, strict=True):
             figures[f"variance/{name}"] = float(variance(moments))
@@ -133,9 +139,9 @@ class PitfallCallback(Diagnosis):
 
     The pitfalls: a learning rate that is too large; one that is too small for the number of updates; returns that are
     not scaled; too few episodes; the total return; gradients that spike without clipping; a critic that explains hardly
-    anything; a policy that is deterministic too early; episodes that are cut. They are detected from what training
-    computes anyway. The cost is two forward passes and a backward pass of the actor over each rollout. Training is not
-    changed.
+    anything; a policy that is deterministic too early; episodes that are cut. They are detected from the log and the
+    rollouts of the training: nothing is sampled for it, and training is not changed. The cost is two forward passes and
+    a backward pass of the actor over each rollout.
 
     A FiniteDifference is refused: it has no returns that weight scores.
 
@@ -161,16 +167,15 @@ class PitfallCallback(Diagnosis):
         rollout: Rollout = self.model.rollout
         self.rollout = rollout
         policy = rollout.policy
-        obs, actions = used_inputs(rollout)
-        self.obs = obs
+        batch = training_batch(rollout, self.model.rollout_buffer, self.model.normalize_advantage)
+        self.obs = batch.observations
         self.temperature = temperature_of(policy)
         # A copy: the buffer is reset before the update is examined
-        self.targets = select(th.as_tensor(by_step(self.model.rollout_buffer)[1]), rollout.used).clone()
-        log_prob = log_prob_of(policy, obs, actions)
+        self.targets = batch.returns.clone()
+        log_prob = log_prob_of(policy, batch.observations, batch.actions)
         self.gradient = th.zeros(0)
         if log_prob.requires_grad and (parameters := actor_parameters(policy, *first_step(rollout))):
-            weights = select(training_weights(self.model), rollout.used).to(log_prob)
-            objective = (log_prob * weights).sum() / rollout.denominator
+            objective = (log_prob * batch.weights).sum() / rollout.denominator
             gradient = to_vector(th.autograd.grad(objective, parameters, allow_unused=True))
             self.gradient = gradient[:: 1 + len(gradient) // self.N_COMPONENTS].clone()
         leave_no_graph(policy, *first_step(rollout))

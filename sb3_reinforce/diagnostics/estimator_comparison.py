@@ -79,8 +79,9 @@ def compare_estimators(
     θ is the actor's parameters without ``log_std``. One estimate is one episode with reward-to-go and the leave-one-out
     baseline for the likelihood ratio, and ``n_delta`` perturbations with one episode per utility for the others. The
     signal-to-noise ratio of a mean of estimates is proportional to their number, so the ratio per step does not depend
-    on the size of an estimate. With fewer perturbations than parameters an estimate lies in the span of
-    the perturbations. Its expectation is a multiple of the gradient, and the cosine belongs to this expectation.
+    on the size of an estimate. With fewer perturbations than parameters an estimate lies in the span of the
+    perturbations. The cosine belongs to its expectation, which for small perturbations of a built-in kind is a multiple
+    of the gradient.
 
     :param model: The model; it is not changed, and its environments are left at the start of an episode
     :param n_episodes: Episodes of the likelihood ratio, and as many again for the reference gradient, at least 3

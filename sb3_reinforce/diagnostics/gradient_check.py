@@ -1,5 +1,6 @@
 """Is the gradient right? The debugging checklist of the policy gradient, as a function that measures each item."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -23,7 +24,7 @@ from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
-from sb3_reinforce.estimation.weights import by_step, without_rounding
+from sb3_reinforce.estimation.weights import standardize, without_rounding
 from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
@@ -36,7 +37,7 @@ CHECKS = {
     "scores": (0.02, "∇ log π by autograd and by finite differences"),
     "sign": (0.0, "fraction of sampled actions that a step along their own score makes less likely"),
     "returns": (1e-4, "G_t and its definition from the rewards"),
-    "weights": (1e-4, "the weights used in training and G_t − b_t"),
+    "weights": (1e-4, "the weights used in training and γ^t (G_t − b_t)"),
     "surrogate": (1e-3, "the step of train() and Σ w_t ∇ log π"),
 }
 
@@ -84,7 +85,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     - ``sign``: after a step along the score of an action, the policy samples it more often, or samples closer to it.
       ``log_std`` is left out. A policy that always samples the same action, or learns nothing else than ``log_std``,
       cannot be checked, and does not pass.
-    - ``returns`` and ``weights``: G_t and G_t − b_t follow from the rewards by their definitions.
+    - ``returns`` and ``weights``: G_t and γ^t (G_t − b_t) follow from the rewards by their definitions, with γ^t and
+      normalized as the model does.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
     Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before
@@ -164,7 +166,7 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
     ``G_t = (1 − λ) Σ_{n=1}^{N−1} λ^{n−1} G_{t:t+n} + λ^{N−1} G_{t:t+N}``, ``G_{t:t+n} = Σ_{k<n} γ^k r_{t+k} + γ^n V``,
     for rewards and V(s_{t+1}) of one episode, each of shape (T,).
 
-    Sutton and Barto (2018), equations 12.1 and 12.3, term by term instead of by a recursion.
+    Sutton and Barto (2018), equations 12.1 and 12.9, term by term instead of by a recursion.
     """
     returns = np.zeros(len(rewards))
     for t in range(len(rewards)):
@@ -175,11 +177,16 @@ def return_by_definition(rewards: np.ndarray, next_values: np.ndarray, gamma: fl
     return returns
 
 
+def steps_by_episode(rollout: Rollout) -> Iterator[tuple[th.Tensor, ...]]:
+    """The steps and environments of each episode, in the order in which they were played."""
+    for episode in rollout.used_episodes:
+        yield ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
+
+
 def return_error(collector: REINFORCE, rollout: Rollout) -> float:
     """The largest difference between a return and its definition, relative to the largest return."""
     expected = th.zeros_like(rollout.returns)
-    for episode in rollout.used_episodes:
-        steps, envs = ((rollout.episodes == episode) & rollout.used).nonzero(as_tuple=True)
+    for steps, envs in steps_by_episode(rollout):
         values = np.zeros(len(steps)) if rollout.next_values is None else rollout.next_values[steps, envs].numpy()
         rewards = rollout.rewards[steps, envs].numpy()
         returns = return_by_definition(rewards, values, collector.gamma, collector.gae_lambda)
@@ -189,16 +196,20 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """``‖w − (G − b)‖ / max(‖w‖, ‖G − b‖)`` over the used steps, where training reads w from the rollout buffer."""
+    """The relative difference of the weights of ``train()`` and γ^t (G_t − b_t), with t counted in each episode."""
     baseline = collector.baseline
     values = baseline.values if isinstance(baseline, Recorded) else BASELINES[cast(str, baseline)](rollout)
-    differences = without_rounding(rollout.returns - values.cpu(), rollout.returns)
-    expected = differences.masked_fill(~rollout.used, 0.0)
-    return relative_difference(th.as_tensor(by_step(collector.rollout_buffer)[0]).double(), expected)
+    differences = without_rounding(rollout.returns - values.cpu(), rollout.returns).float()[rollout.used]
+    expected = th.zeros_like(rollout.returns)
+    expected[rollout.used] = (standardize(differences) if collector.normalize_advantage else differences).double()
+    if collector.discount_scores and collector.reward_to_go:
+        for steps, envs in steps_by_episode(rollout):
+            expected[steps, envs] *= collector.gamma ** th.arange(len(steps))
+    return relative_difference(training_weights(collector), expected)
 
 
 def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """A step of ``train()`` by SGD, without entropy bonus and clipping, against the mean of ``w_t ∇ log π``."""
+    """A step of ``train()`` by SGD, without entropy bonus and clipping, against ``Σ_t w_t ∇ log π / D``."""
     gradients = gradients_by_episode(rollout, training_weights(collector))[0]
     by_steps = collector.normalize_by == "steps"
     expected = gradients.sum(0) / (int(rollout.used.sum()) if by_steps else len(rollout.used_episodes))
@@ -207,7 +218,7 @@ def surrogate_error(collector: REINFORCE, rollout: Rollout) -> float:
     # A step as long as θ where the gradient is shorter: a short one would drown in the rounding of θ
     rate = min(1e6, max(1.0, float(before.norm() / expected.norm())))
     collector.policy.optimizer = th.optim.SGD(collector.policy.parameters(), lr=rate)
-    collector.learning_rate = rate
+    # A ``CheckedSchedule`` would be made again from ``learning_rate``
     collector.lr_schedule = FloatSchedule(rate)
     # Without values no critic is trained
     collector.rollout = replace(rollout, values=None)

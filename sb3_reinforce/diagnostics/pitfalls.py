@@ -69,8 +69,8 @@ def step_bound(history: History) -> tuple[str, float]:
 
 def rate_too_large(history: History) -> str | None:
     """
-    A KL divergence above 1 in one update, a median above 0.1 over ten, or a loss of more than half of the randomness
-    within ten, unless the temperature has fallen.
+    A KL divergence above 1 in one update, a median above 0.1 over ten, or randomness that falls within ten by more than
+    half of what the policy could have, unless the temperature has fallen.
     """
     updates = history.updates[-10:]
     steps = [update.kl for update in updates if not math.isnan(update.kl)]
@@ -96,7 +96,7 @@ def rate_too_large(history: History) -> str | None:
 
 def rate_too_small(history: History) -> str | None:
     """
-    After half of the training, steps ``√(2 KL)`` below 0.01 on average, whose sum will stay below 0.3 at this rate.
+    After half of the training and ten updates, steps ``√(2 KL)`` below 0.01 on average, whose sum will stay below 0.3.
 
     If all steps have one direction, the policy ends at a KL divergence of about ``path² / 2``, 0.045, from its start;
     otherwise it ends nearer.
@@ -161,7 +161,7 @@ def uses_total_return(history: History) -> str | None:
     if not history.model.reward_to_go and history.updates[-1].n_steps > history.updates[-1].n_episodes:
         return (
             "Every action is weighted by the total return, which includes rewards from before it. Set "
-            "reward_to_go=True, whose gradient has a lower variance"
+            "reward_to_go=True, which usually has less variance (and with discount_scores=True the same expectation)"
         )
     return None
 

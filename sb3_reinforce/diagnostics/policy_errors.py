@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -15,7 +16,7 @@ from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.diagnostics.sampling import seeded
 from sb3_reinforce.estimation.scores import score_parameters
 from sb3_reinforce.policies.evaluation import Parameters, evaluate, log_prob_of, trainable
-from sb3_reinforce.policies.parameters import write
+from sb3_reinforce.policies.parameters import restored, write
 from sb3_reinforce.policies.sequences import RecurrentPolicy, without_memory
 
 # Elements of the observations in a forward pass
@@ -68,8 +69,8 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
     curve log π more. Large logits and biases are scaled down to 1: log π near 0 is mostly rounding.
     """
     # It may stand in another module, as with a mask
-    parts = [part for name, part in policy.named_modules() if name.split(".")[0] == "action_net"]
-    layers = [part for part in parts if isinstance(part, th.nn.Linear)]
+    parts = policy.named_modules()
+    layers = [part for name, part in parts if name.split(".")[0] == "action_net" and isinstance(part, th.nn.Linear)]
     size = size_of_outputs(layers[-1], lambda: log_prob_of(policy, obs, actions)) if layers else 0.0
     if size == 0:
         # Not the layer that the distribution comes from
@@ -102,15 +103,11 @@ def size_of_outputs(layer: th.nn.Linear, evaluate: Callable[[], object]) -> floa
 @contextmanager
 def scaled(layer: th.nn.Linear, scale: float, are_logits: bool) -> Iterator[None]:
     """Multiply the weights of a layer in the block, and scale biases of logits down to at most 1."""
-    parameters = [*layer.parameters()]
-    before = to_vector(parameters)
-    write([layer.weight], layer.weight.detach().flatten() * scale)
-    if are_logits and layer.bias is not None:
-        write([layer.bias], layer.bias.detach() / max(1.0, float(layer.bias.detach().abs().max())))
-    try:
+    with restored([*layer.parameters()]):
+        write([layer.weight], layer.weight.detach().flatten() * scale)
+        if are_logits and layer.bias is not None:
+            write([layer.bias], layer.bias.detach() / max(1.0, float(layer.bias.detach().abs().max())))
         yield
-    finally:
-        write(parameters, before)
 
 
 def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) -> float:
@@ -143,12 +140,11 @@ def difference_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
 @th.no_grad()
 def values_at(thetas: th.Tensor, parameters: Parameters, function: Callable[[], th.Tensor]) -> th.Tensor:
     """``f(θ)`` (k,) at θs (k, n), where f depends on the parameters, which are as before afterwards."""
-    before = to_vector(parameters)
     values = []
-    for theta in thetas:
-        write(parameters, theta)
-        values.append(function())
-    write(parameters, before)
+    with restored(parameters):
+        for theta in thetas:
+            write(parameters, theta)
+            values.append(function())
     return th.stack(values)
 
 
@@ -185,8 +181,7 @@ def sampling_error(policy: ActorCriticPolicy, obs: PyTorchObs, n_obs: int) -> fl
     errors = []
     for index in th.randperm(n_obs)[:N_OBSERVATIONS]:
         one = take(obs, index[None])
-        many = take(one, th.zeros(n_draws, dtype=th.long))
-        many = without_memory(many) if isinstance(policy, RecurrentPolicy) else many
+        many = repeated(policy, one, n_draws)
         pair = []
         for _ in range(2):
             actions = draw(policy, one, n_draws)
@@ -211,10 +206,15 @@ def draw(policy: ActorCriticPolicy, one: PyTorchObs, n: int) -> th.Tensor:
     """Independent actions ``(n, ...)`` for one observation; with gSDE each has its own noise matrix."""
     if policy.use_sde:
         policy.reset_noise(n)
+    obs = repeated(policy, one, n)
+    drawn = policy.sequence_distribution(obs).get_actions() if isinstance(policy, RecurrentPolicy) else policy(obs)[0]
+    return as_evaluated(policy, drawn)
+
+
+def repeated(policy: ActorCriticPolicy, one: PyTorchObs, n: int) -> Any:
+    """``n`` copies of one observation, each the first of its episode for a policy with a memory."""
     obs = take(one, th.zeros(n, dtype=th.long))
-    if isinstance(policy, RecurrentPolicy):
-        return as_evaluated(policy, policy.sequence_distribution(without_memory(obs)).get_actions())
-    return as_evaluated(policy, policy(obs)[0])
+    return without_memory(obs) if isinstance(policy, RecurrentPolicy) else obs
 
 
 def closeness(policy: ActorCriticPolicy, draws: th.Tensor, action: th.Tensor) -> th.Tensor:

@@ -17,7 +17,7 @@ from sb3_reinforce.common.arguments import check_flag, check_integer, check_kind
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
 from sb3_reinforce.estimation.weights import by_step, compute_weights
-from sb3_reinforce.policies.parameters import evaluation_mode
+from sb3_reinforce.policies.evaluation import evaluation_mode
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
 

@@ -53,7 +53,11 @@ def variance(moments: Moments) -> th.Tensor:
 
 
 def signal_to_noise(moments: Moments) -> th.Tensor:
-    """``SNR = ‖E g‖² / tr Σ`` (Roberts and Tedrake, 2009), consistent; negative if no signal is detected."""
+    """
+    ``SNR = ‖E g‖² / tr Σ``, the inverse of the noise scale, consistent; negative if no signal is detected.
+
+    Roberts and Tedrake (2009) compare the components along and across the gradient instead.
+    """
     return moments.signal / variance(moments)
 
 
@@ -66,9 +70,9 @@ def cosine(moments: Moments, reference: Moments, products: th.Tensor, confidence
     """
     ``cos = ⟨E g, E r⟩ / (‖E g‖ ‖E r‖)`` with products ``⟨E g, E r⟩`` (1 + r,), NaN if no signal is detected.
 
-    Consistent: the norm of the sample mean in the denominator would add noise to it, and make the cosine too small by
-    about ``√(1 + B / m)`` at noise scale B. Where 0 is in the interval of ``‖E g‖²`` or ``‖E r‖²`` the direction is
-    unknown, and the interval is [−1, 1].
+    Consistent: the norm of the sample mean in the denominator would add noise to it, and make the cosine too small by a
+    factor of about ``√(1 + B / m)`` at noise scale B. Where 0 is in the interval of ``‖E g‖²`` or ``‖E r‖²`` the
+    direction is unknown, and the interval is [−1, 1].
     """
     squares = moments.signal.clamp(min=0) * reference.signal.clamp(min=0)
     found = interval((products / squares.sqrt()).clamp(-1, 1), confidence)

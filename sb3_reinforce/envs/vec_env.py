@@ -27,10 +27,10 @@ class GymnasiumVecEnv(VecEnv):
     A vector environment of Gymnasium for the algorithms of Stable-Baselines3.
 
     Each copy is reset within the step that ends its episode; its infos then have ``terminal_observation`` and
-    ``TimeLimit.truncated``, as with ``DummyVecEnv``. Observations and rewards are checked for their form at each step.
-    Wrap it in ``VecMonitor`` to record the episodes from which ``rollout/ep_rew_mean`` is computed. ``seed(s)`` gives
-    copy ``i`` the seed ``s + i`` at the next reset, where the vector environment seeds that way. Attributes can only be
-    set for all copies at once, and methods can only be called where each copy is an environment.
+    ``TimeLimit.truncated``, as with ``DummyVecEnv``. Observations and rewards are checked for their form at each reset
+    and step. Wrap it in ``VecMonitor`` to record the episodes from which ``rollout/ep_rew_mean`` is computed.
+    ``seed(s)`` gives copy ``i`` the seed ``s + i`` at the next reset, where the vector environment seeds that way.
+    Attributes can only be set for all copies at once, and methods can only be called where each copy is an environment.
 
     :param env: A vector environment with ``autoreset_mode`` ``SAME_STEP`` or ``DISABLED``, or Gymnasium's vectorized
         CartPole, which is then reset within the step
@@ -54,6 +54,7 @@ class GymnasiumVecEnv(VecEnv):
         if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
         obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
+        check_batch(self.observation_space, obs, self.num_envs)
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -95,7 +96,10 @@ class GymnasiumVecEnv(VecEnv):
                 infos[i] |= info_of(episodes, i)
                 check_observation(self.observation_space, take(last_obs, i), i)
                 infos[i]["terminal_observation"] = map_parts(np.array, take(last_obs, i))
-            obs, reset_infos = (obs, env_infos) if self.restart is None else self.restart(self.env, dones)
+            reset_infos = env_infos
+            if self.restart is not None:
+                obs, reset_infos = self.restart(self.env, dones)
+                check_batch(self.observation_space, obs, self.num_envs)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
         # A copy: the environment may write its next observations into the same arrays

@@ -2,8 +2,8 @@
 Baselines: what is subtracted from the return before it weights a score. One pure function each.
 
 A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. It keeps the gradient unbiased as long as
-b_t does not depend on the action at t or on its consequences (Williams, 1992, theorems 1 and 2). A user's own function
-is a baseline too.
+b_t does not depend on the action at t or on its consequences (Greensmith, Bartlett and Baxter, 2004). A user's own
+function is a baseline too.
 
 "Other episodes" are the others of the same group: of the rollout, or with ``episodes_per_start`` of the same start.
 ``mean`` always takes all.
@@ -93,8 +93,8 @@ def optimal(rollout: Rollout) -> th.Tensor:
     ``S_j = Σ_t γ^t ∇log π(a_t|s_t)`` is the score of episode j and ``A_j = Σ_t γ^t ∇log π(a_t|s_t) G_t``, without γ^t
     unless ``discount_scores``. A constant b leaves the trace of the covariance of A − b S as
     E‖A‖² − 2b E⟨A, S⟩ + b² E‖S‖² + const, since E[S] = 0; this b minimizes it. For the total return it is the mean of
-    G_0 weighted by ‖S_j‖² (Peters and Schaal, 2008, section 3.2, summed over components). Unbiased, because the sums
-    leave out the episode that b is applied to.
+    G_0 weighted by ‖S_j‖² (Weaver and Tao, 2001; Greensmith, Bartlett and Baxter, 2004; for each component: Peters and
+    Schaal, 2008, section 3.2). Unbiased, because the sums leave out the episode that b is applied to.
 
     :param rollout: The rollout
     :return: b_t

@@ -16,6 +16,8 @@ from typing import Any, TypeAlias
 
 import torch as th
 
+from sb3_reinforce.common.tensors import ROUNDING
+
 Utility: TypeAlias = Callable[[th.Tensor], th.Tensor]
 Estimator: TypeAlias = Callable[[Utility, th.Tensor, th.Tensor], th.Tensor]
 
@@ -110,7 +112,7 @@ def check_deltas(theta: th.Tensor, deltas: Any) -> th.Tensor:
 
 def check_design(design: th.Tensor, deltas: th.Tensor) -> None:
     """Raise an error before an environment is stepped if a design of shape ``(k, n)`` is zero but for rounding."""
-    if design.abs().max() <= 1e-12 * deltas.abs().max():
+    if design.abs().max() <= ROUNDING * deltas.abs().max():
         raise ValueError(
             f"The {len(deltas)} perturbations have no usable direction: forward and central differences need one that "
             "is not zero, the regression needs two that are not equal. Raise n_delta, or change the perturbation"

@@ -44,7 +44,7 @@ def lambda_return(
     ``G_t = r_t + γ [(1 − λ) V(s_{t+1}) + λ G_{t+1}]``, and ``G_t = r_t + γ V(s_{t+1})`` at the last step of an episode
     or of the rollout.
 
-    Source: Sutton and Barto (2018), equation 12.2 in recursive form. G_t − V(s_t) is the generalized advantage estimate
+    Source: Sutton and Barto (2018), equation 12.9 in recursive form. G_t − V(s_t) is the generalized advantage estimate
     (Schulman et al., 2016, equation 16).
 
     :param rewards: Shape ``(n_steps, n_envs)``
@@ -64,7 +64,7 @@ def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
     """
     ``G_t = Σ_{k≥t} γ^{k−t} r_k`` over the rest of the episode, or of the rollout.
 
-    It is the λ-return with λ = 1 and without a critic. Source: Sutton and Barto (2018), equation 3.8.
+    It is the λ-return with λ = 1 and without a critic. Source: Sutton and Barto (2018), equation 3.11.
 
     :param rewards: Shape ``(n_steps, n_envs)``
     :param dones: Shape ``(n_steps, n_envs)``

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_reinforce.common.tensors import select
+from sb3_reinforce.common.tensors import ROUNDING, select
 from sb3_reinforce.envs.checks import check_finite
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.returns import Bools, Floats, Integers, lambda_return, total_return
@@ -22,9 +22,6 @@ from sb3_reinforce.estimation.rollout import (
     used_inputs,
     within_quota,
 )
-
-# Differences up to this fraction of the numbers are rounding errors
-ROUNDING = 1e-12
 
 
 def complete_rollout(
@@ -113,7 +110,7 @@ def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th
 
 
 def standardize(weights: th.Tensor) -> th.Tensor:
-    """``(w − mean) / std``, or w if there are fewer than two samples or all are equal."""
+    """``(w − mean) / (std + 1e-8)`` as in PPO, or w if there are fewer than two samples or all are equal."""
     if len(weights) < 2 or weights.max() == weights.min():
         return weights
     return (weights - weights.mean()) / (weights.std() + 1e-8)
@@ -174,7 +171,7 @@ def check_used(used: Bools) -> None:
 
 
 def check_baseline(baseline: Any, rollout: Rollout) -> th.Tensor:
-    """b_t, float64, on the CPU; an error unless it is a tensor of shape ``(n_steps, n_envs)``, finite at used steps."""
+    """b_t, 0 at unused steps, float64, on the CPU; an error unless a tensor of shape ``(n_steps, n_envs)``, finite."""
     if not isinstance(baseline, th.Tensor):
         raise TypeError(f"baseline must return a tensor, got {type(baseline).__name__}")
     if baseline.shape != rollout.returns.shape:

@@ -4,7 +4,8 @@ temperature. A method that a user has overridden is called as it is; ``calls`` s
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias, cast
 
 import torch as th
@@ -63,6 +64,17 @@ def extract_features(policy: ActorCriticPolicy, obs: PyTorchObs, extractor: nn.M
         # The result of the line below, at a tenth of the cost
         return obs.flatten(1).float()
     return BasePolicy.extract_features(policy, obs, extractor)  # type: ignore[arg-type]
+
+
+@contextmanager
+def evaluation_mode(policy: BasePolicy) -> Iterator[None]:
+    """Put a policy in evaluation mode in the block; restore its mode."""
+    training = policy.training
+    policy.set_training_mode(False)
+    try:
+        yield
+    finally:
+        policy.set_training_mode(training)
 
 
 def distribution_of(policy: ActorCriticPolicy, outputs: th.Tensor) -> Distribution:

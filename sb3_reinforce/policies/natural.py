@@ -50,7 +50,8 @@ def natural_step(
     target_kl: float,
 ) -> tuple[float, float]:
     """
-    ``θ ← θ − α d`` with ``(F + c I) d = g`` and ``α² dᵀ F d / 2 = target_kl``; returns ‖g‖ and the mean divergence.
+    ``θ ← θ − α d`` with ``(F + c I) d = g / ‖g‖`` and ``α² dᵀ F d / 2 = target_kl``, for the gradient g of the loss;
+    returns ‖g‖ and the mean divergence.
 
     The parameters stay as they are, with a warning, where no such step is found.
     """

@@ -7,24 +7,13 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from gymnasium.vector.utils import create_empty_array
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import actor_parameters, leave_no_graph
-
-
-@contextmanager
-def evaluation_mode(policy: BasePolicy) -> Iterator[None]:
-    """Put a policy in evaluation mode in the block; restore its mode."""
-    training = policy.training
-    policy.set_training_mode(False)
-    try:
-        yield
-    finally:
-        policy.set_training_mode(training)
+from sb3_reinforce.policies.evaluation import actor_parameters, evaluation_mode, leave_no_graph
 
 
 def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
@@ -67,6 +56,16 @@ def split(thetas: th.Tensor, parameters: Sequence[th.Tensor]) -> list[th.Tensor]
         part.reshape(-1, *parameter.shape).to(parameter.device, parameter.dtype)
         for part, parameter in zip(parts, parameters, strict=True)
     ]
+
+
+@contextmanager
+def restored(parameters: Sequence[th.Tensor]) -> Iterator[None]:
+    """Set the parameters to their present values when the block ends."""
+    before = to_vector(parameters)
+    try:
+        yield
+    finally:
+        write(parameters, before)
 
 
 @th.no_grad()

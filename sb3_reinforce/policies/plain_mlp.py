@@ -143,6 +143,16 @@ def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
     return outputs if hook is None else outputs / hook.temperature
 
 
+def numpy_layers(
+    policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = ActorCriticPolicy
+) -> list[nn.Module] | None:
+    """The layers of a plain actor that ``numpy_forward`` can compute, else None."""
+    layers = plain_actor(policy, base)
+    if layers is None or not has_numpy_form(layers) or not takes_vectors(policy, policy.pi_features_extractor):
+        return None
+    return layers
+
+
 def has_numpy_form(layers: list[nn.Module]) -> bool:
     """Whether ``numpy_forward`` can compute these layers: tanh and ReLU after linear ones, in float32 on a CPU."""
     if not isinstance(layers[0], nn.Linear) or not all(type(layer) in (nn.Linear, *IN_PLACE) for layer in layers):

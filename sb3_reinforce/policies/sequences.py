@@ -22,7 +22,7 @@ from torch.utils.checkpoint import checkpoint
 from sb3_reinforce.policies.memories import MEMORIES, State, check_memory, initialize
 
 # "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
-# hidden and cell state, unless all sequences start from zero
+# hidden and cell state, unless all sequences start from zero; "features" where they are known already
 Rows: TypeAlias = dict[str, Any]
 # Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
 FLOATS = 2**24

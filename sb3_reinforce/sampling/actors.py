@@ -22,7 +22,7 @@ from torch import nn
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.policies.evaluation import must_call
-from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, has_numpy_form, numpy_forward, plain_actor, takes_vectors
+from sb3_reinforce.policies.plain_mlp import HOOKS, Float32s, numpy_forward, numpy_layers
 
 # Actions (n_envs, *shape); and V(s) and log π(a|s) (n_envs,) if they come along with the actions
 Acted: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
@@ -129,8 +129,8 @@ def addresses_of(policy: ActorCriticPolicy, layers: list[nn.Module]) -> list[int
 def make_actor(policy: ActorCriticPolicy, calls_forward: bool, n_envs: int, with_log_prob: bool) -> Actor:
     """The fastest actor that acts as the policy would; it may leave out log π without ``with_log_prob``."""
     # forward returns V too
-    layers = None if calls_forward else plain_actor(policy)
-    if layers and has_numpy_form(layers) and takes_vectors(policy, policy.pi_features_extractor):
+    layers = None if calls_forward else numpy_layers(policy)
+    if layers is not None:
         return NumpyActor(policy, layers, n_envs, with_log_prob)
     return PolicyActor(policy, calls_forward, with_log_prob)
 

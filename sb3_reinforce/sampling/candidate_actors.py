@@ -44,9 +44,8 @@ class LoopActor:
     @uninterrupted
     def act(self, obs: Any) -> np.ndarray:
         """The actions in all environments, shape ``(n_envs, *action_space.shape)``, as the environments take them."""
-        center = to_vector(self.searched)
         actions = []
-        try:
+        with parameters.restored(self.searched):
             for i, theta in enumerate(self.thetas):
                 parameters.write(self.searched, theta)
                 if self.policy.use_sde and not self.deterministic:
@@ -54,8 +53,6 @@ class LoopActor:
                     self.policy.reset_noise()
                 action, _ = self.policy.predict(take(obs, slice(i, i + 1)), deterministic=self.deterministic)
                 actions.append(action)
-        finally:
-            parameters.write(self.searched, center)
         return shift_to_start(self.policy.action_space, np.concatenate(actions))
 
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_reinforce.estimation.returns import Bools
-from sb3_reinforce.policies.plain_mlp import has_numpy_form, is_unchanged, linear_operation, plain_actor, takes_vectors
+from sb3_reinforce.policies.plain_mlp import is_unchanged, linear_operation, numpy_layers
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.sampling.actors import Acted, NumpyActor, PolicyActor
 
@@ -111,10 +111,7 @@ def make_recurrent_actor(
 
 def numpy_head(policy: Any) -> list[nn.Module] | None:
     """The layers after an LSTM that NumPy can compute, or None."""
-    layers = plain_actor(policy, RecurrentPolicy)
     lstm = policy.lstm_actor
-    if layers is None or not has_numpy_form(layers) or not takes_vectors(policy, policy.pi_features_extractor):
-        return None
     if type(lstm) is not nn.LSTM or not is_unchanged(lstm) or lstm.num_layers > 1 or not lstm.bias:
         return None
-    return layers
+    return numpy_layers(policy, RecurrentPolicy)

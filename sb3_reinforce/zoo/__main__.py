@@ -118,7 +118,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         except (TypeError, ValueError) as error:
             parser.error(f"{option}: {error}")
     if command != "train":
-        check_model(parser, command, given)
+        check_trained_model(parser, command, given)
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
@@ -126,7 +126,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
 
 
-def check_model(parser: argparse.ArgumentParser, command: str, given: argparse.Namespace) -> None:
+def check_trained_model(parser: argparse.ArgumentParser, command: str, given: argparse.Namespace) -> None:
     """Exit with a sentence where there is no model, unless it is one that the Zoo downloads."""
     which = (given.load_best, given.load_checkpoint, given.load_last_checkpoint)
     try:

@@ -50,6 +50,17 @@ def test_it_logs_every_so_many_rollouts():
     assert history["gradient/cosine"] == [pytest.approx(float(th.cosine_similarity(before, after, dim=0)), abs=1e-5)]
 
 
+def test_no_cosine_joins_updates_with_a_rollout_in_between_at_which_the_actor_was_frozen():
+    def freeze(model):
+        model.policy.action_net.requires_grad_(model.num_timesteps != 256)
+        model.policy.mlp_extractor.policy_net.requires_grad_(model.num_timesteps != 256)
+
+    frozen = Record(freeze, "rollout_start")
+    _, history = train([frozen, GradientQualityCallback(1)], 640)
+    assert len(history["gradient/snr"]) == 4
+    assert "gradient/cosine" not in history
+
+
 def test_episodes_of_one_start_are_not_taken_for_independent():
     _, history = train(GradientQualityCallback(1), 1024, baseline="leave_one_out", episodes_per_start=2)
     assert set(history) == {"gradient/cosine"}

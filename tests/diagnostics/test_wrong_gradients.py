@@ -18,6 +18,7 @@ from sb3_reinforce import REINFORCE, ActionMaskObservation, MaskedPolicy
 from sb3_reinforce.diagnostics import check_gradient
 from sb3_reinforce.diagnostics.policy_errors import sampling_error
 from sb3_reinforce.estimation import weights
+from sb3_reinforce.estimation.rollout import timesteps_of
 
 
 def altered(log_prob=lambda log_prob, actions: log_prob, actions=lambda actions: actions):
@@ -117,8 +118,8 @@ class TwoSteps(REINFORCE):
         super().train()
 
 
-def failures(algorithm=REINFORCE, policy="MlpPolicy"):
-    model = algorithm(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
+def failures(algorithm=REINFORCE, policy="MlpPolicy", **kwargs):
+    model = algorithm(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0, **kwargs)
     with th.no_grad():
         # A policy that is far from uniform
         model.policy.action_net.weight.mul_(100)
@@ -145,6 +146,19 @@ def test_what_is_wrong_is_named(wrong, lines):
 def test_weights_are_not_checked_by_what_computes_them(monkeypatch):
     monkeypatch.setattr(weights, "check_baseline", lambda baseline, rollout: -baseline)
     assert failures() == ["weights"]
+
+
+@pytest.mark.parametrize(
+    ("function", "replacement", "argument"),
+    [
+        ("timesteps_of", lambda *args: timesteps_of(*args) + 1, "discount_scores"),
+        ("standardize", lambda given: given, "normalize_advantage"),
+    ],
+)
+def test_discounts_and_normalization_are_checked_by_their_definitions(function, replacement, argument, monkeypatch):
+    assert failures(**{argument: True}) == []
+    monkeypatch.setattr(weights, function, replacement)
+    assert failures(**{argument: True}) == ["weights"]
 
 
 def test_negation_is_seen_in_every_action_space():

@@ -251,6 +251,28 @@ def test_malformed_steps_are_named(change, message):
     assert model.learn(100).num_timesteps >= 100
 
 
+class Fractions(SyncVectorEnv):
+    """Returns fractions at each reset, or only at those by a mask."""
+
+    def __init__(self, *args, at_first, **kwargs):
+        self.at_first = at_first
+        super().__init__(*args, **kwargs)
+
+    def reset(self, *, seed=None, options=None):
+        # Gymnasium takes the mask out of the options
+        is_wrong = self.at_first or bool(options)
+        obs, infos = super().reset(seed=seed, options=options)
+        return (obs + 0.5 if is_wrong else obs), infos
+
+
+@pytest.mark.parametrize("at_first", [True, False])
+def test_malformed_observations_of_resets_are_named(at_first):
+    space = spaces.Box(0, 255, (4,), np.uint8)
+    env = synced(lambda: Random(space), "Disabled", Fractions, at_first=at_first)
+    with pytest.raises(ValueError, match=r"observation of environment 0 must have .* that fits uint8"):
+        make("steps", env).learn(100)
+
+
 class Numbers(SyncVectorEnv):
     """Ends episodes by numbers, and resets copies as vectorized environments do, by a mask of an array."""
 
