@@ -11,6 +11,7 @@
 
 # %%
 import argparse
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +31,7 @@ parser.add_argument("--forget-bias", type=float, default=0.0, help="of the forge
 parser.add_argument("--timesteps", type=int, default=45_000)
 parser.add_argument("--seed", type=int, default=0)
 # A notebook is started with other arguments
-arguments, _ = parser.parse_known_args()
+arguments = parser.parse_args([] if "ipykernel" in sys.modules else None)
 th.set_num_threads(1)
 
 

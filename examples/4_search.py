@@ -89,7 +89,8 @@ for name in ("gaussian", "sphere", "rademacher"):
 # Each episode of Pendulum starts at another angle, and the start decides much of the return. If all candidates of a
 # difference start alike, as they do by default (`common_random_numbers=True`), this luck cancels. `CandidateUtility`
 # samples the actions; with a small standard deviation most of the noise is in the starts. On CartPole starts hardly
-# differ, and common starts only cost steps: turn them off (the run above kept the default).
+# differ. With several environments common starts only cost steps there, since environments wait for each other's
+# episodes: turn them off.
 
 # %%
 env = make_vec_env("Pendulum-v1", 8, seed=seed)

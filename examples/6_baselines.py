@@ -14,9 +14,9 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.diagnostics import compare_baselines, gradients_by_episode, sample
+from sb3_reinforce.diagnostics import compare_baselines, sample
 from sb3_reinforce.diagnostics.plots import plot_baselines
-from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.estimation import BASELINES, gradients_by_episode
 
 seed = 0
 th.set_num_threads(1)

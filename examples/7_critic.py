@@ -14,8 +14,8 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
-from sb3_reinforce.diagnostics import gradient_statistics, gradients_by_episode, sample
-from sb3_reinforce.estimation import lambda_return
+from sb3_reinforce.diagnostics import gradient_statistics, sample
+from sb3_reinforce.estimation import gradients_by_episode, lambda_return
 
 seed = 0
 th.set_num_threads(1)

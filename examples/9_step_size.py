@@ -106,8 +106,9 @@ assert np.median(scales[-3:]) > 1.5 * np.median(scales[:3])
 # ## Two guards
 #
 # `max_grad_norm` bounds the norm of the gradient, which limits the weight of one unlucky batch.
-# `normalize_advantage=True` scales the weights of a batch to mean 0 and standard deviation 1. Then rewards that are 100
-# times as large make the same step, also with plain gradient ascent (Adam itself divides by the scale):
+# `normalize_advantage=True` scales the weights of a batch to mean 0 and standard deviation 1. With either of them
+# rewards that are 100 times as large make the same step here, also with plain gradient ascent (Adam itself divides by
+# the scale). The bound cuts both gradients; one that is never reached changes nothing:
 
 
 # %%
@@ -127,13 +128,18 @@ class Scaled(gym.Env):
         return np.ones(1, dtype=np.float32), self.scale * float(action), True, False, {}
 
 
-arguments = {"baseline": "none", "n_episodes": 20, "max_grad_norm": None, "device": "cpu", "seed": seed}
+arguments = {"baseline": "none", "n_episodes": 20, "device": "cpu", "seed": seed}
 arguments["policy_kwargs"] = {"net_arch": [], "optimizer_class": th.optim.SGD}
-for normalize in (False, True):
+guards = {
+    "none": {"max_grad_norm": None},
+    "max_grad_norm": {"max_grad_norm": 0.1},
+    "normalize_advantage": {"max_grad_norm": None, "normalize_advantage": True},
+}
+for name, guard in guards.items():
     steps = []
     for scale in (1.0, 100.0):
-        model = REINFORCE("MlpPolicy", Scaled(scale), normalize_advantage=normalize, **arguments)
+        model = REINFORCE("MlpPolicy", Scaled(scale), **guard, **arguments)
         before = model.policy.action_net.bias.detach().clone()
         steps.append((model.learn(1).policy.action_net.bias.detach() - before).norm().item())
-    print(f"normalize_advantage={normalize}: lengths of the steps {steps[0]:.6f} and {steps[1]:.6f}")
-    assert np.isclose(steps[1] / steps[0], 1 if normalize else 100, rtol=0.01)
+    print(f"{name:20s} lengths of the steps {steps[0]:.6f} and {steps[1]:.6f}")
+    assert np.isclose(steps[1] / steps[0], 100 if name == "none" else 1, rtol=0.01)

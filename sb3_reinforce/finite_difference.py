@@ -82,8 +82,9 @@ class FiniteDifference(BasePolicyGradient):
     :param n_delta: k, the perturbations per update. None: ``min(2n, 64)`` up to n = 42 and ``min(n / 2, 64)``
         beyond, at least ``n_top``; differences along coordinates have ``min(n, 64)``. It is chosen at construction:
         set ``model.n_delta = None`` after layers are frozen
-    :param delta_std: What the perturbations are multiplied by: the standard deviation of the change of a parameter
-        (``"coordinate"``: the change of the one that changes). A float or a schedule. None: 1 % of ‖θ‖, at least 0.05
+    :param delta_std: The scale of the perturbations: the standard deviation of the change of each parameter, or with
+        ``"coordinate"`` the change of the one parameter that is perturbed. A float or a schedule. None: 1 % of ‖θ‖, at
+        least 0.05
     :param n_eval_episodes: Episodes per candidate, whose utility is their mean return
     :param common_random_numbers: Let candidates that are compared start from the same seeds. It removes the noise of
         the start from differences, but environments that wait for the longest episode of a round go on: their steps
@@ -279,7 +280,7 @@ class FiniteDifference(BasePolicyGradient):
         :raises ValueError: As ``learn``, or if ``learn`` was never called
         """
         if self.ep_info_buffer is None:
-            raise ValueError("estimate_gradient needs the counters and the log of learn(), which was never called")
+            raise ValueError("estimate_gradient needs the counters and the log that learn creates: call learn(0) first")
         callback.on_rollout_start()
         # The user or a callback may have changed arguments
         self._check_arguments()

@@ -69,9 +69,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     (Williams, 1992, section 5 and theorem 2, for the total return; Sutton et al., 2000, for G_t; γ^t only with
     ``discount_scores``). m_t is 1 for the steps that are used: those whose return is known and, with ``n_episodes``, in
     an episode of the quota. The denominator is ``n_steps * n_envs`` for fixed rollouts; for whole episodes see
-    ``normalize_by``. With ``baseline="none"``, ``"leave_one_out"`` or ``"optimal"``, ``n_episodes``,
-    ``normalize_by="episodes"``, ``discount_scores=True``, ``ent_coef=0`` and neither normalized advantages nor
-    clipping, E[ĝ] is exactly ∇θ E[G_0]. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
+    ``normalize_by``. E[ĝ] is exactly ∇θ E[G_0] with ``n_episodes``, ``normalize_by="episodes"``,
+    ``discount_scores=True``, ``ent_coef=0``, the baseline ``"none"``, ``"leave_one_out"`` or ``"optimal"``, and without
+    ``normalize_advantage`` and clipping. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
     gradient where the noise depends on the features. So are dropout, batch normalization and noisy layers, with which
     the policy that is trained is not the one that acts, as in A2C.
 
@@ -88,9 +88,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a class)
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
     :param learning_rate: The learning rate, it can be a function of the progress that remains (from 1 to 0)
-    :param n_steps: Steps per environment and rollout, as in A2C. With neither ``n_steps`` nor ``n_episodes``:
-        32 steps for ``baseline="value"``, for the others 16 episodes, or one of each environment if there are more
-        (with ``episodes_per_start``, always one of each)
+    :param n_steps: Steps per environment and rollout, as in A2C. If ``n_steps`` and ``n_episodes`` are both None: 32
+        steps with ``baseline="value"``, else 16 episodes, or one per environment if there are more than 16
+        environments. With ``episodes_per_start`` above 1 it is always one episode per environment
     :param gamma: Discount factor
     :param gae_lambda: λ of the λ-return G_t: 1 is the Monte Carlo return, 0 the one-step return r_t + γ V(s_{t+1}).
         Below 1 only with ``baseline="value"`` and ``reward_to_go=True``
@@ -101,8 +101,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param baseline: b_t: ``"none"``, ``"mean"``, ``"time_mean"``, ``"leave_one_out"``, ``"value"``, ``"optimal"``, or a
         function of a ``Rollout`` that returns a tensor of shape ``(n_steps, n_envs)``
     :param n_episodes: Whole episodes per rollout, instead of ``n_steps``. Between rollouts all environments are reset,
-        unless all of them have just ended an episode. Each contributes a number of episodes fixed beforehand, some none
-        if there are more environments than episodes; steps beyond them are made and counted, but not used
+        unless all of them have just ended an episode. Each environment contributes a number of episodes that is fixed
+        beforehand, and some contribute none if there are more environments than episodes. Steps after these episodes
+        are counted, but not used
     :param episodes_per_start: m > 1 lets the episodes of m neighboring environments start from the same seed, and
         ``"time_mean"``, ``"leave_one_out"`` and ``"optimal"`` compare these only (Kool et al., 2019). It pays where
         much of the variance of the return lies between starts: ask ``diagnostics.compare_starts``. A rollout is then
@@ -431,7 +432,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         rollout = self.rollout
         if rollout is None:
-            raise ValueError("train needs a rollout: call learn, which collects them")
+            raise ValueError("train needs a rollout: call learn, which collects one")
         ent_coef = self._scheduled("ent_coef")
         critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)

@@ -27,7 +27,8 @@ def read(name: str) -> pd.DataFrame:
 
 def number(value: float, digits: int = 1) -> str:
     """A number with a true minus sign; thousands have no decimals."""
-    return f"{value:.{0 if abs(value) >= 1000 else digits}f}".replace("-", "−")
+    text = f"{value:.{0 if abs(value) >= 1000 else digits}f}"
+    return text.replace("-", "−" if float(text) else "")
 
 
 def short(steps: int) -> str:

@@ -13,11 +13,9 @@ def copy_pages(source: Path, target: Path) -> None:
     target.mkdir(exist_ok=True)
     pages = {}
     for path in source.glob("[0-9]*.py"):
-        text = path.read_text()
-        if re.search(r"^# %% \[markdown\]", text, re.MULTILINE):
-            # With two digits, the order of the names is the order of the tutorial
-            number, _, name = path.name.partition("_")
-            pages[f"{int(number):02}_{name}"] = text + links(f"{int(number):02}_{name}", path.name)
+        # With two digits, the order of the names is the order of the tutorial
+        number, _, name = path.name.partition("_")
+        pages[f"{int(number):02}_{name}"] = path.read_text() + links(f"{int(number):02}_{name}", path.name)
     for name, text in pages.items():
         if not (target / name).exists() or (target / name).read_text() != text:
             (target / name).write_text(text)

@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     th.set_num_threads(1)
-    writer = csv.writer(sys.stdout)
+    writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(["env", "policy", "n_gradients", "n_delta", "estimator", "variance_ratio", "steps_ratio"])
     for estimator in ("central", "forward", "regression"):
         variances, steps = {}, {}

@@ -3,9 +3,10 @@ How do REINFORCE and FiniteDifference compare with A2C, PPO, TRPO and ARS: by st
 
     python examples/benchmarks/compare.py --tasks CartPole-v1 LunarLander-v3 --seeds 0 1 2 3 4 --output results.csv
 
-All get the same tasks, seeds, step budgets and machine, and one torch thread each. The peers take the RL Zoo's
-settings (for another version of the task where it has none for this one, or else its default), and ours take
-``sb3_reinforce.zoo``'s; the two searches are run only on tasks that they have settings for.
+All get the same tasks, seeds and step budgets, and one torch thread each; ours may train on shorter episodes
+(``train_env_kwargs`` of their settings). The peers take the RL Zoo's settings (for another version of the task where it
+has none for this one, or else its default), and ours take ``sb3_reinforce.zoo``'s; the two searches are run only on
+tasks that they have settings for.
 
 The CSV has a row per evaluation: on 10 deterministic episodes at the start of the first rollout after each twentieth of
 the budget, and at the end on ``--final-episodes``. ``steps`` are true ones, ``seconds`` without the evaluations, and
@@ -146,8 +147,6 @@ def train(final_episodes: int, params: dict[str, Any] | None, run: Run) -> tuple
     """
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    # Ctrl-C is the main process's to answer
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         model, env, eval_env = make(run, params)
         evaluations = Evaluations(run, env, eval_env)
@@ -205,7 +204,9 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         map_runs: Any = map
         if is_alone:
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes))
+            # Ctrl-C is the main process's to answer
+            ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes, **ignore))
             map_runs = pool.imap_unordered
         elif not is_leader():
             runs = [run for run in runs if run.algorithm in OURS]

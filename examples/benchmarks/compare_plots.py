@@ -25,7 +25,7 @@ from sb3_reinforce.diagnostics.plots import COLORS, interquartile_interval
 REPETITIONS = 2000
 LABELS = {
     "reinforce": "REINFORCE", "finite_difference": "FiniteDifference", "a2c": "A2C", "ppo": "PPO", "ars": "ARS",
-    "trpo": "TRPO",
+    "trpo": "TRPO", "reinforce_lstm": "RecurrentREINFORCE", "ppo_lstm": "RecurrentPPO",
 }  # fmt: skip
 # Mean return of uniformly random actions (100 episodes), and of PPO in the Zoo's benchmark.md, whose versions of
 # LunarLander and MuJoCo's tasks are older
@@ -42,7 +42,7 @@ REFERENCES = {
     "HalfCheetah-v5": (-282.5, 5819.0),
     "Hopper-v5": (16.7, 2410.0),
     "Walker2d-v5": (1.8, 3479.0),
-    "Swimmer-v5": (0.8, 282.0),
+    "Swimmer-v5": (0.8, 281.6),
     "Ant-v5": (-48.0, 1327.0),
     # For the tasks below benchmark.md has no PPO. The return at which Gymnasium calls CarRacing solved
     "CarRacing-v3": (-32.6, 900.0),
@@ -101,7 +101,8 @@ def seeds(counts: Collection[int]) -> str:
 
 
 def color(algorithm: str) -> str:
-    return COLORS[list(LABELS).index(algorithm)] if algorithm in LABELS else "black"
+    # The last two are never in a picture with the first
+    return COLORS[list(LABELS).index(algorithm) % len(COLORS)] if algorithm in LABELS else "black"
 
 
 def final_scores(results: pd.DataFrame) -> dict[str, np.ndarray]:

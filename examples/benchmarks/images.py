@@ -50,7 +50,7 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    writer = csv.writer(sys.stdout)
+    writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(["n_envs", "device", "REINFORCE / A2C"])
     for n_envs in arguments.n_envs:
         kwargs = {"n_steps": 32, "device": arguments.device}

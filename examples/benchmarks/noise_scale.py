@@ -73,7 +73,7 @@ def main() -> None:
     warnings.filterwarnings("ignore")
     # Its runs take hours: an older file is kept
     with open(arguments.output, "x", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["task", "budget", "seed", "n_episodes", "mean_episodes", "return"])
         for seed, task, size in itertools.product(arguments.seeds, arguments.tasks, (*SIZES, None)):
             run = Run(task, "reinforce", seed, arguments.timesteps or BUDGETS[task])

@@ -182,7 +182,7 @@ def main() -> None:
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
     with arguments.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["contender", "seed", "rate", "seconds", "steps"])
+        writer = csv.DictWriter(file, ["contender", "seed", "rate", "seconds", "steps"], lineterminator="\n")
         writer.writeheader()
         for seed in arguments.seeds:
             for name in arguments.contenders:

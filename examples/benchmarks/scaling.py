@@ -91,7 +91,7 @@ def main() -> None:
         ]
         print(*rows[-len(CONTENDERS) :], sep="\n", flush=True)
     with arguments.output.with_suffix(".csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     draw(rows, arguments.rounds, arguments.output.with_suffix(".png"))

@@ -49,7 +49,7 @@ def main() -> None:
     for _ in range(arguments.rounds):
         ours = gradients_per_second(FiniteDifference, arguments.n_envs, arguments, estimator="central")
         ratios.append(ours / gradients_per_second(ARS, 1, arguments, zero_policy=False))
-    writer = csv.writer(sys.stdout)
+    writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(["env", "policy", "rounds", "median", "least", "greatest"])
     figures = (statistics.median(ratios), min(ratios), max(ratios))
     writer.writerow([arguments.env, arguments.policy, arguments.rounds, *(f"{figure:.1f}" for figure in figures)])

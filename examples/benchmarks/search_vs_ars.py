@@ -3,8 +3,9 @@ Does FiniteDifference end as high as SB3-Contrib's ARS with the RL Zoo's setting
 
     python examples/benchmarks/search_vs_ars.py --env Pendulum-v1 --seeds 20 21 22 23 24 --output search.csv
 
-FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Each run ends with the mean return of 100 episodes of the
-final policy, and adds a line to the CSV.
+FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Each run adds a line to the CSV, with the mean return of
+100 episodes of the last policy within the budget. A VecNormalize has the statistics of the end of training, a little
+later.
 """
 
 import argparse
@@ -76,7 +77,7 @@ def main() -> None:
             print(*row, "| after learn():", model.num_timesteps, round(after, 1), flush=True)
             is_new = not arguments.output.exists()
             with arguments.output.open("a", newline="") as file:
-                writer = csv.writer(file)
+                writer = csv.writer(file, lineterminator="\n")
                 if is_new:
                     writer.writerow(["env", "algorithm", "seed", "budget", "steps", "mean_return"])
                 writer.writerow(row)

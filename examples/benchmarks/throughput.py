@@ -10,7 +10,8 @@ and their medians printed. With rollouts of 2048 steps REINFORCE and A2C make on
 Where the time of a vector step of 8 CartPole-v1 environments goes, in rollouts of 2048 steps (microseconds on one core
 of a shared machine; the shares are what counts): environments 46 (their VecEnv's own ``step`` takes 54), actor and
 sampling 7, bookkeeping and storage 5 (and 4 with a callback), critic's values 3, returns and checks 1, policy step 11,
-critic's pass 5. Measured with a timer around each part. Of what is learning, more than half is matrix products.
+critic's pass 5. Measured once with a timer around each part (not listed). Of what is learning, more than half is matrix
+products.
 """
 
 import argparse
@@ -58,7 +59,7 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    writer = csv.DictWriter(sys.stdout, COLUMNS)
+    writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
     writer.writeheader()
     for env_id in arguments.env:
         for n_envs in arguments.n_envs:

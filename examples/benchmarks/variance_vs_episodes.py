@@ -64,7 +64,7 @@ def main() -> None:
     variances = np.array([[gradients.var(0).sum(1).tolist() for gradients in group] for group in groups])
     arguments.output.mkdir(parents=True, exist_ok=True)
     with open(arguments.output / "variance_vs_episodes.csv", "w", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["baseline", "n_episodes", "group", "variance"])
         for index, name in enumerate(BASELINES):
             for group, row in enumerate(variances[:, :, index]):

@@ -90,7 +90,7 @@ def check_subclass(name: str, value: Any, base: type) -> Any:
 
 def check_device(name: str, value: Any) -> Any:
     """Return a device that PyTorch knows, or "auto"."""
-    check_kind(name, value, (str, th.device))
+    check_kind(name, value, (str, th.device), "'auto', a name such as 'cuda', or a torch.device")
     try:
         return value if value == "auto" else th.device(value)
     except RuntimeError as error:
@@ -123,7 +123,8 @@ class CheckedSchedule(FloatSchedule):
             value = 0.0
         # At the end of training nothing is drawn any more
         is_excluded = progress_remaining == 1 if self.may_reach else progress_remaining > 0
-        return self.check(f"{self.name} (at progress {progress_remaining:g})", value, above=self.above and is_excluded)
+        where = f"{self.name} (at progress_remaining={progress_remaining:g})"
+        return self.check(where, value, above=self.above and is_excluded)
 
 
 def optional(check: Check) -> Check:

@@ -129,7 +129,7 @@ class BasePolicyGradient(Distributed):
         Save the model, with the states of the global random generators. A save that fails leaves the file as it was.
 
         :param path: The file, to which ``.zip`` is added where it has no suffix; under torchrun process 0 writes it
-        :param exclude: Attributes not to save, besides those that never are; not the one that ``load`` needs
+        :param exclude: Further attributes not to save; the one by which ``load`` recognizes the class is always saved
         :param include: Attributes to save that otherwise are not
         :raises OSError: If the file cannot be written
         """
@@ -162,7 +162,7 @@ class BasePolicyGradient(Distributed):
         :param restore_random_state: Restore the global generators of Python, NumPy and PyTorch (on the CPU and the
             model's device) as they were saved. Training then continues as if it had not been interrupted, from a reset
             of the environments on; the file has neither the environments' state and generators nor the statistics of
-            VecNormalize. If False, a model with a seed seeds them: call ``set_random_seed`` for others
+            VecNormalize. If False, a model with a seed seeds them: call ``set_random_seed`` to use another
         :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones. An
             ``lr_schedule`` that was set by hand is not stored
         :return: The model
@@ -203,7 +203,7 @@ class BasePolicyGradient(Distributed):
         :param env: As many environments as before, with the same spaces
         :param force_reset: Whether to reset them before training; whole episodes always begin with a reset
         :raises TypeError: If ``env`` is not an environment, or ``force_reset`` is not a flag
-        :raises ValueError: If their number or spaces are others
+        :raises ValueError: If their number or their spaces differ from the model's
         """
         check_flag("force_reset", force_reset)
         super().set_env(check_env(env, self.verbose, self.n_envs), force_reset)
@@ -221,9 +221,9 @@ class BasePolicyGradient(Distributed):
         From a file only tensors are read (``weights_only``): no code in it is run.
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
-        :param exact_match: Whether there must be a state for everything that has one here, and nothing else. If not,
-            some may be missing, and FiniteDifference leaves out REINFORCE's ``critic_optimizer``. With a warning,
-            parameters with other names and the state of another kind of optimizer are left out
+        :param exact_match: Whether the states must be exactly those that ``get_parameters`` returns here. If False, a
+            state of another kind of optimizer, and missing or unknown parameters, are left out with a warning; without
+            all parameters of the policy, its optimizer's state is too. FiniteDifference ignores ``critic_optimizer``
         :param device: Device on which the parameters are loaded
         :raises TypeError: If an argument is of the wrong type, or a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or

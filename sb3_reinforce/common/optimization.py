@@ -56,9 +56,9 @@ def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parame
                     parameter.copy_(old)
             optimizer.state.clear()
             raise ValueError(
-                f"A step made a parameter of the {name} that is not finite. The parameters are those before it, and "
-                "the optimizer starts with an empty state; a lower learning_rate, other optimizer_kwargs or scaled "
-                "rewards (VecNormalize) may help"
+                f"The update of the {name} left a parameter that is not finite. The parameters are those before this "
+                "update, and the optimizer starts with an empty state; a lower learning_rate, other optimizer_kwargs "
+                "or scaled rewards (VecNormalize) may help"
             )
 
 

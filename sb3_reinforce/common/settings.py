@@ -37,19 +37,17 @@ MAX_SEED = 2**32 - 1
 MAX_TEMPERATURE = 1e6
 # Noise this strong drowns a mean or a parameter
 MAX_STD = 1e6
-USE_RECURRENT = (
-    "policies with a memory are for sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may do as well"
-)
+USE_RECURRENT = "a memory needs sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may be enough instead"
 USE_MASKED_POLICY = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
 CONTRIB_POLICIES = dict.fromkeys(RECURRENT, USE_RECURRENT) | {"MaskableActorCriticPolicy": USE_MASKED_POLICY}
-NO_CLIPPING = "it takes one policy step per rollout, which max_grad_norm alone bounds"
+NO_CLIPPING = "it takes one policy step per rollout, bounded by max_grad_norm, or with step='natural' by target_kl"
 USE_POLICY_KWARGS = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead
 INSTEAD_OF_PPO = {
     "n_epochs": "it takes one policy step per rollout; n_critic_updates is the number of the critic's passes",
     "clip_range": NO_CLIPPING,
-    "clip_range_vf": NO_CLIPPING,
+    "clip_range_vf": "the critic's loss is not clipped; max_grad_norm bounds the gradient of each of its steps",
     "use_rms_prop": USE_POLICY_KWARGS,
     "rms_prop_eps": USE_POLICY_KWARGS,
 }
@@ -58,7 +56,7 @@ NO_BUFFER = "it keeps the returns of its episodes, and no steps"
 NO_PROBABILITIES = "it perturbs the parameters, and does not need the probabilities of actions"
 # Arguments of the on-policy algorithms, and what FiniteDifference has instead
 INSTEAD_OF_ON_POLICY = {
-    "n_steps": "each of the candidates of its n_delta perturbations plays n_eval_episodes whole episodes",
+    "n_steps": "each candidate plays n_eval_episodes whole episodes, and n_delta is the number of perturbations",
     "n_epochs": "it takes one step per update",
     "normalize_advantage": "set standardize_utilities=True",
     **dict.fromkeys(("use_rms_prop", "rms_prop_eps"), USE_POLICY_KWARGS),
@@ -104,8 +102,8 @@ COMMON_ARGUMENTS: dict[str, Check] = {
     "max_grad_norm": optional(partial(check_number, low=0, high=math.inf, above=True)),
     "max_episode_steps": check_count,
     "stats_window_size": check_count,
-    "tensorboard_log": optional(partial(check_kind, kinds=(str, os.PathLike))),
-    "policy_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
+    "tensorboard_log": optional(partial(check_kind, kinds=(str, os.PathLike), allowed="a path")),
+    "policy_kwargs": optional(partial(check_kind, kinds=(Mapping,), allowed="a dict")),
     "verbose": check_verbose,
     "seed": optional(partial(check_integer, low=0, high=MAX_SEED)),
     "device": check_device,
@@ -129,7 +127,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),
     "rollout_buffer_class": optional(partial(check_subclass, base=RolloutBuffer)),
-    "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,))),
+    "rollout_buffer_kwargs": optional(partial(check_kind, kinds=(Mapping,), allowed="a dict")),
     "normalize_advantage": check_flag,
     "step": partial(check_choice, choices=("optimizer", "natural")),
     "target_kl": optional(CheckedSchedule),
@@ -180,7 +178,7 @@ def check_reinforce(model: Any) -> None:
             model._choose("n_episodes", n_envs if shares_starts else max(16, n_envs))
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
-        raise ValueError(f"{given} are both given: a rollout is one or the other, so set one of them to None")
+        raise ValueError(f"{given} are both given: a rollout has a length in steps or in episodes. Set one to None")
     compares_episodes = model.baseline in ("time_mean", "leave_one_out", "optimal")
     # For episodes that share their start, check_starts says what is allowed
     if model.n_episodes == 1 and compares_episodes and not shares_starts:
@@ -214,9 +212,9 @@ def check_starts(model: Any) -> None:
         return
     if model.n_steps is not None or model.n_episodes != n_episodes or model.n_envs % m:
         raise ValueError(
-            f"episodes_per_start={m} needs one whole episode of each environment, n_episodes={n_episodes} or None, and "
-            f"a multiple of {m} environments: got n_steps={model.n_steps}, n_episodes={model.n_episodes} and "
-            f"{model.n_envs} environments"
+            f"episodes_per_start={m} needs one whole episode of each environment (n_steps=None, and n_episodes=None or "
+            f"{n_episodes}) and a number of environments that {m} divides, got n_steps={model.n_steps}, "
+            f"n_episodes={model.n_episodes} and n_envs={model.n_envs}"
         )
     if model.baseline in ("none", "mean", "value"):
         raise ValueError(
@@ -235,7 +233,7 @@ def check_finite_difference(model: Any) -> None:
     if model.n_top is not None and model.estimator != "central":
         raise ValueError(f"n_top={model.n_top!r} needs estimator='central', got estimator={model.estimator!r}")
     if model.n_top is not None and model.n_delta is not None and model.n_top > model.n_delta:
-        raise ValueError(f"n_top={model.n_top!r} needs an n_delta of at least that, got n_delta={model.n_delta!r}")
+        raise ValueError(f"n_top must be at most n_delta={model.n_delta!r}, got {model.n_top!r}")
 
 
 def check_learn(env: Any, *arguments: Any) -> None:
@@ -244,6 +242,7 @@ def check_learn(env: Any, *arguments: Any) -> None:
         raise ValueError("env is None, and learning needs an environment: pass one to load, or call set_env")
     default = th.get_default_device()
     if default.type != "cpu":
-        raise ValueError(f"PyTorch's default device must be the CPU, got {default}: give the model device=... instead")
+        reset = "call th.set_default_device('cpu'), and give the model device=... instead"
+        raise ValueError(f"PyTorch's default device must be the CPU, got {default}: {reset}")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

@@ -151,7 +151,8 @@ def load_policy(policy: th.nn.Module, state: Mapping[str, Any], exact_match: boo
     if missing:
         warnings.warn(f"load_path_or_dict['policy'] has no {', '.join(missing)}: they stay as they are", stacklevel=3)
     if others:
-        warnings.warn(f"{kind} has no {', '.join(others)} of load_path_or_dict['policy']: left out", stacklevel=3)
+        left_out = f"{', '.join(others)} of load_path_or_dict['policy']: they are left out"
+        warnings.warn(f"{kind} has no {left_out}", stacklevel=3)
     return not (missing or others)
 
 
@@ -167,8 +168,8 @@ def load_part(part: th.nn.Module | th.optim.Optimizer, name: str, state: Any, ex
         part.load_state_dict(deepcopy(dict(state)))
     elif exact_match:
         raise ValueError(
-            f"{needed}, but {reason}. If you have replaced the optimizer, make the model, replace it again, and call "
-            "set_parameters, which leaves this state out with exact_match=False"
+            f"{needed}, but {reason}. If the saved model had another optimizer, make a model, give it that optimizer, "
+            "and call set_parameters. To leave this state out, call set_parameters with exact_match=False"
         )
     else:
         warnings.warn(f"{needed}, but {reason}. It is left out", stacklevel=3)

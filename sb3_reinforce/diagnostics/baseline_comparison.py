@@ -107,7 +107,10 @@ def functions_of(baselines: Any) -> dict[str, Baseline]:
         function = check_function("baselines", baseline, BASELINES)
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
         if name == "floor" or functions.get(name, function) is not function:
-            raise ValueError(f"baselines must have names that differ, and {name!r} is the name of another row")
+            raise ValueError(
+                f"baselines must have names that differ from each other and from 'floor', got {name!r} again: set the "
+                "__name__ of your function"
+            )
         functions[name] = function
     return functions
 

@@ -58,8 +58,8 @@ class GradientQualityCallback(Diagnosis):
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, if a baseline is unknown or needs a critic that the model
-        lacks, if the model's episodes share gSDE's noise, or if another callback, such as ``EveryNTimesteps``, is to
-        call it
+        lacks, if the model's episodes share gSDE's noise, or if it is passed to an ``EventCallback`` such as
+        ``EveryNTimesteps`` instead of ``learn``
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class PitfallCallback(Diagnosis):
 
     :param verbose: Verbosity level
     :raises TypeError: If the model is not a REINFORCE
-    :raises ValueError: If another callback, such as ``EveryNTimesteps``, is to call it
+    :raises ValueError: If it is passed to an ``EventCallback`` such as ``EveryNTimesteps`` instead of ``learn``
     """
 
     # Components of a gradient that are kept

@@ -81,12 +81,12 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
 
     - ``log_prob``: the log π that training differentiates is the log π of the sampled actions.
     - ``sampling``: actions are sampled with these probabilities, as far as their mean log π shows it.
-    - ``scores``: its gradient by autograd equals its gradient by finite differences.
+    - ``scores``: the gradient of log π by autograd equals its gradient by finite differences.
     - ``sign``: after a step along the score of an action, the policy samples it more often, or samples closer to it.
-      ``log_std`` is left out. A policy that always samples the same action, or learns nothing else than ``log_std``,
-      cannot be checked, and does not pass.
-    - ``returns`` and ``weights``: G_t and γ^t (G_t − b_t) follow from the rewards by their definitions, with γ^t and
-      normalized as the model does.
+      ``log_std`` is left out. A policy that always samples the same action, or trains nothing but ``log_std``, cannot
+      be checked, and does not pass.
+    - ``returns`` and ``weights``: G_t and γ^t (G_t − b_t) follow from the rewards by their definitions. The model's
+      ``discount_scores`` and ``normalize_advantage`` count.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
     Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before

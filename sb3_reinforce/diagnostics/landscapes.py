@@ -13,6 +13,7 @@ from sb3_reinforce.common.arguments import check_integer, check_kind, check_numb
 from sb3_reinforce.diagnostics.sampling import env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import check_directions
 from sb3_reinforce.estimation.estimators import check_candidates
+from sb3_reinforce.policies.evaluation import evaluation_mode
 from sb3_reinforce.policies.parameters import read, searched_parameters
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
@@ -62,8 +63,7 @@ class CandidateUtility:
         seeds = seeds_of(thetas.shape, self.n_episodes, self.seed)
         self.seed = int(seeds[-1, -1]) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)
-        with undisturbed(self.model):
-            self.model.policy.set_training_mode(False)
+        with undisturbed(self.model), evaluation_mode(self.model.policy):
             returns = evaluate_candidates(self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
@@ -131,7 +131,7 @@ def landscape(
     utility = CandidateUtility(model, n_episodes, seed)
     n = len(utility.theta)
     if not utility.theta.any():
-        raise ValueError("landscape needs parameters that are not all 0: the directions get their norm")
+        raise ValueError("model's actor parameters are all 0, and landscape scales its directions to their norm")
     gradients = {} if gradients is None else gradients
     check_kind("gradients", gradients, (Mapping,), "a dictionary of tensors by name")
     if directions is None:

@@ -151,7 +151,7 @@ def too_few_episodes(history: History) -> str | None:
         shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "
-            f"{shown}, with {n_steps:.0f} steps of {n_episodes:.1f} episodes an update. Raise {argument}"
+            f"{shown}, with {n_steps:.0f} steps from {n_episodes:.1f} episodes per update. Raise {argument}"
         )
     return None
 
@@ -188,8 +188,8 @@ def useless_critic(history: History) -> str | None:
     late = history.n_updates >= 100 and history.progress_remaining < 0.5
     if history.model.has_critic and late and len(explained) >= 25 and median(explained) < 0.05:
         return (
-            f"The critic explains hardly anything of the returns: the median of train/explained_variance is "
-            f"{median(explained):.2g}. Raise n_critic_updates={history.model.n_critic_updates!r} or "
+            f"The critic explains almost none of the variance of the returns: the median of train/explained_variance "
+            f"is {median(explained):.2g}. Raise n_critic_updates={history.model.n_critic_updates!r} or "
             "critic_learning_rate, scale the returns (VecNormalize), or use another baseline"
         )
     return None
@@ -205,7 +205,7 @@ def deterministic_too_early(history: History) -> str | None:
             remedy = "raise min_std or log_std_init (for actions in the hundreds, scale them to [-1, 1])"
         ent_coef = scheduled(history.model.ent_coef, history)
         return (
-            f"With {left:.0%} of the training left the policy is all but deterministic ({share:.1%} of the randomness "
+            f"With {left:.0%} of the training left the policy is almost deterministic ({share:.1%} of the randomness "
             f"that it could have), and its scores vanish. Raise ent_coef (now {ent_coef:.2g}), "
             f"{remedy}, or lower {step_bound(history)[0]}"
         )

@@ -166,7 +166,7 @@ def plot_variances(
 
     x = np.asarray(n_episodes, dtype=float)
     if check_number("confidence", confidence, 0, 1) == 1:
-        raise ValueError("confidence must be below 1, where an interval is finite, got 1")
+        raise ValueError("confidence must be below 1, since an interval of confidence 1 is infinite, got 1")
     given = arrays_of("curves", curves)
     for name, variances in given.items():
         if variances.ndim != 2 or len(variances) < 2 or variances.shape[1:] != x.shape:
@@ -202,7 +202,7 @@ def plot_landscape(scape: Landscape, ax: Axes | None = None) -> Axes:
     :return: The Axes
     :raises TypeError: If ``scape`` is not a ``Landscape``
     """
-    check_kind("scape", scape, (Landscape,))
+    check_kind("scape", scape, (Landscape,), "the Landscape that landscape returns")
     ax = new_axes(ax, (6.0, 6.6))
     # Half a step beyond the outer points, which are the centers of pixels
     end = scape.scales[-1] * (1 + 1 / (len(scape.scales) - 1))

@@ -56,7 +56,8 @@ def compare_starts(
 
     The model's policy plays eight episodes from each start, with the model's γ. What the environment draws after the
     start is shared too, and counts as part of it. Where all returns are equal, nothing is known, and the share is NaN.
-    With few starts the intervals are too narrow. For images, it takes several passes over the episodes.
+    With few starts the intervals are too narrow. For networks with many parameters, such as a CnnPolicy, the
+    measurement takes several passes over the episodes.
 
     :param model: The model; it is not changed. Its environments get new seeds, and are left at the start of an episode
     :param n_starts: Number of starts, at least 4; rounded up until the environments play equal numbers of episodes

@@ -44,9 +44,9 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
 def cannot_seed(base: Any) -> ValueError:
     """The error for environments that cannot be reset with a seed each."""
     return ValueError(
-        "Episodes that are to start from the same seeds need env_method('reset', seed=...), which "
-        f"{type(base).__name__} does not have here: use another VecEnv. FiniteDifference trains without it with "
-        "common_random_numbers=False, and REINFORCE with episodes_per_start=1"
+        "Episodes can start from given seeds only where env_method('reset', seed=...) works, and "
+        f"{type(base).__name__} does not support it here: use another VecEnv, or set common_random_numbers=False "
+        "(FiniteDifference) or episodes_per_start=1 (REINFORCE)"
     )
 
 
@@ -92,6 +92,6 @@ def check_groups(obs: Any, size: int) -> None:
     check_finite("The observation", obs, (None,))
     if not are_alike(obs, size):
         raise ValueError(
-            "Episodes cannot share their start: after reset(seed=...) with the same seed and another reset, the "
-            "observations differ. The environment must draw all random numbers from self.np_random"
+            "Episodes cannot share their start: environments reset with the same seed, and then once more without a "
+            "seed, return different observations. The environment must draw all random numbers from self.np_random"
         )

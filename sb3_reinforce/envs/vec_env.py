@@ -73,12 +73,15 @@ class GymnasiumVecEnv(VecEnv):
         terminated = np.asarray(terminated, dtype=bool)
         truncated = np.asarray(truncated, dtype=bool)
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
-            raise BadData(f"The rewards must be {self.num_envs} numbers, one an environment, got {rewards.tolist()}")
+            raise BadData(f"The rewards must be {self.num_envs} numbers, one per environment, got {rewards.tolist()}")
         check_batch(self.observation_space, obs, self.num_envs)
         dones = terminated | truncated
         ended = np.flatnonzero(dones).tolist()
         if self.restart is None and ended and "final_obs" not in env_infos:
-            raise ValueError(f"{self.env} says that it resets its copies in the same step, but gave no final_obs")
+            raise ValueError(
+                f"{self.env} has autoreset_mode SAME_STEP, but its infos have no 'final_obs' where an episode ended: "
+                "return it from step, or use autoreset_mode DISABLED"
+            )
         # A copy that has reset itself returns the last step's observation and infos in separate entries
         last_obs = env_infos.pop("final_obs", obs)
         last_infos = env_infos.pop("final_info", env_infos)
@@ -179,7 +182,8 @@ def find_restart(env: VectorEnv[Any, Any, Any]) -> Callable[[Any, NDArray[np.boo
             for forgetful, instead in ((RecordEpisodeStatistics, "VecMonitor"), (NormalizeReward, "VecNormalize")):
                 if isinstance(wrapper, forgetful):
                     raise ValueError(
-                        f"{env} would forget the episodes that go on when others end: use {instead} instead"
+                        f"{forgetful.__name__} with autoreset_mode DISABLED clears the statistics of all copies when "
+                        f"one of them is reset: leave it out of {env}, and wrap the GymnasiumVecEnv in {instead}"
                     )
             wrapper = wrapper.env
         return restart_by_mask

@@ -39,7 +39,7 @@ def mean(rollout: Rollout) -> th.Tensor:
     expected gradient is too small by ``∇E[mean_t G_t] / N``.
 
     :param rollout: The rollout
-    :return: b_t
+    :return: b_t, shape ``(n_steps, n_envs)``, float64
     """
     return th.full_like(rollout.returns, float(rollout.returns[rollout.used].mean()))
 
@@ -52,7 +52,7 @@ def time_mean(rollout: Rollout) -> th.Tensor:
     mean with weight 1/N. A step that a single episode reaches has weight G_t − b_t = 0.
 
     :param rollout: The rollout
-    :return: b_t
+    :return: b_t, shape ``(n_steps, n_envs)``, float64
     """
     totals, counts = sums_by_timestep(rollout)
     return totals / counts.clamp(min=1)
@@ -66,7 +66,7 @@ def leave_one_out(rollout: Rollout) -> th.Tensor:
     samples").
 
     :param rollout: The rollout
-    :return: b_t
+    :return: b_t, shape ``(n_steps, n_envs)``, float64
     """
     totals, counts = sums_by_timestep(rollout)
     return (totals - rollout.returns) * rollout.used / (counts - 1).clamp(min=1)
@@ -78,7 +78,7 @@ def value(rollout: Rollout) -> th.Tensor:
     episode is cut.
 
     :param rollout: The rollout; ``values`` must not be None
-    :return: b_t
+    :return: b_t, shape ``(n_steps, n_envs)``, float64
     :raises ValueError: If the rollout has no values
     """
     if rollout.values is None:
@@ -97,7 +97,7 @@ def optimal(rollout: Rollout) -> th.Tensor:
     Schaal, 2008, section 3.2). Unbiased, because the sums leave out the episode that b is applied to.
 
     :param rollout: The rollout
-    :return: b_t
+    :return: b_t, shape ``(n_steps, n_envs)``, float64
     """
     products, squares = score_products(rollout)
     b = th.zeros_like(products)
@@ -111,8 +111,8 @@ def optimal(rollout: Rollout) -> th.Tensor:
 
 def score_products(rollout: Rollout) -> tuple[th.Tensor, th.Tensor]:
     """⟨A_j, S_j⟩ and ‖S_j‖² of ``optimal``, shape ``(n_episodes,)``, float64; 0 for an episode without used steps."""
-    # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖², with the mean c of G in the group: in float32 equal returns c would have a
-    # baseline that differs from c
+    # ⟨A, S⟩ = ⟨A − c S, S⟩ + c ‖S‖², with the mean c of G in the group. Without this split, rounding in float32 would
+    # give equal returns c a baseline that differs from c
     totals, counts = sums_at(rollout.groups, rollout)
     level = totals / counts.clamp(min=1)
     products = th.zeros(int(rollout.episodes.max()) + 1, 2, dtype=th.float64)

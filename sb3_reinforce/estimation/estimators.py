@@ -136,7 +136,7 @@ class GradientEstimate:
     :param utilities: Their mean returns, shape ``(m,)``, float64
     :param delta_std: The scale of the perturbations
     :param parameters: The parameters of the policy that θ consists of, with n elements in all
-    :param columns: Of each candidate, the column of candidates that met the same episodes, shape ``(m,)``; None
+    :param columns: The column of each candidate, shape ``(m,)``: candidates of one column had the same seeds. None
         without common random numbers
     """
 

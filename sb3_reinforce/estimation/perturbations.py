@@ -98,8 +98,8 @@ def new_generator() -> th.Generator:
 def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, generator: th.Generator) -> th.Tensor:
     """``Δ = delta_std · δ``, shape ``(k, n)``; the directions δ, which a user's function may draw, are checked."""
     deltas = check_tensor("perturbation", perturbation(k, n, generator), (k, n))
-    # A few signs are often all equal, and leave the regression no direction. Each δ keeps its mean and covariance, but
-    # those of one draw are no longer independent
+    # With few signs in all, the rows are often equal, and the regression has no direction. Drawing again keeps the mean
+    # and covariance of each δ, but the rows of one draw are then no longer independent
     while k > 1 and perturbation in (rademacher, sphere) and (deltas == deltas[0]).all():
         deltas = perturbation(k, n, generator)
     return delta_std * deltas

@@ -48,8 +48,8 @@ def lambda_return(
     (Schulman et al., 2016, equation 16).
 
     :param rewards: Shape ``(n_steps, n_envs)``
-    :param dones: Shape ``(n_steps, n_envs)``
-    :param next_values: V(s_{t+1}), shape ``(n_steps, n_envs)``, or one number for all
+    :param dones: Whether each step is the last of its episode, shape ``(n_steps, n_envs)``
+    :param next_values: V(s_{t+1}), 0 after a terminal state, shape ``(n_steps, n_envs)``, or one number for all
     :param gamma: Discount factor γ
     :param gae_lambda: λ: 1 is the Monte Carlo return, 0 the one-step return
     :return: Shape ``(n_steps, n_envs)``, float64
@@ -67,7 +67,7 @@ def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
     It is the λ-return with λ = 1 and without a critic. Source: Sutton and Barto (2018), equation 3.11.
 
     :param rewards: Shape ``(n_steps, n_envs)``
-    :param dones: Shape ``(n_steps, n_envs)``
+    :param dones: Whether each step is the last of its episode, shape ``(n_steps, n_envs)``
     :param gamma: Discount factor γ
     :return: Shape ``(n_steps, n_envs)``, float64
     """

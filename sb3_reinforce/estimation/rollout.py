@@ -87,7 +87,7 @@ class Rollout:
 
 
 def used_inputs(rollout: Rollout) -> tuple[Any, th.Tensor]:
-    """The used steps in a row, as the policy is evaluated on them: its inputs and the actions."""
+    """The policy's inputs and the actions of the n used steps, each flattened to ``(n, ...)``."""
     actions = as_policy_actions(select(rollout.actions, rollout.used), rollout.policy.action_space)
     return select(rollout.inputs, rollout.used), actions
 
@@ -107,7 +107,7 @@ class Running:
         return cls(np.zeros(n_envs, dtype=int), np.zeros(n_envs))
 
     def restarted(self, where: Bools) -> "Running":
-        """These episodes, and new ones ``where`` an episode starts, as it must in every added environment."""
+        """Start new episodes ``where`` it is True; where environments were added, it must be True."""
         timesteps = np.resize(self.timesteps, len(where))
         rewards = np.resize(self.rewards, len(where))
         return Running(np.where(where, 0, timesteps), np.where(where, 0.0, rewards))
@@ -132,7 +132,7 @@ def in_finished_episode(dones: Bools) -> Bools:
 
 
 def timesteps_of(dones: Bools, first: Integers) -> Integers:
-    """t within the episode, ``(n_steps, n_envs)``: the row minus the episode's first, or ``−first`` if earlier."""
+    """t ``(n_steps, n_envs)``: the row minus the row of the episode's start, ``−first`` if before the rollout."""
     rows = np.arange(len(dones))[:, None]
     starts = np.vstack([-first, np.where(dones, rows + 1, -first)[:-1]])
     return rows - np.maximum.accumulate(starts, axis=0)

@@ -33,7 +33,7 @@ from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
 # Floats that an intermediate result may take, 128 MiB in float32
 CHUNK = 2**25
-# Steps that share a forward and a backward pass: what these leave behind should fit into the cache
+# Steps that share a forward and a backward pass: their activations and gradients should fit into the cache
 STEPS = 4096
 
 # δ (n, n_out) and x (n, n_in), which is 1 for a parameter that is added to z
@@ -62,7 +62,7 @@ def gradients_by_episode(
     shape = rollout.used.shape
     wrong = [weight for weight in weights if not isinstance(weight, th.Tensor) or weight.shape != shape]
     if wrong or not weights:
-        got = wrong[0] if wrong else "none"
+        got = [tuple(each.shape) if isinstance(each, th.Tensor) else each for each in weights] or "none"
         raise ValueError(f"weights must be tensors of the shape of rollout.used, {tuple(shape)}, got {got}")
 
     parameters = parameters_of(rollout)
@@ -142,9 +142,9 @@ def score_parameters(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Ten
     parameters = actor_parameters(policy, obs, actions)
     if not parameters:
         raise ValueError(
-            f"log π of {type(policy).__name__} cannot be differentiated: it depends on none of the policy's "
-            f"{len(trainable(policy))} trainable parameters (is it computed under no_grad, or detached, or does "
-            "policy.optimizer not hold them?)"
+            f"log π of {type(policy).__name__} cannot be differentiated: it depends on none of the "
+            f"{len(trainable(policy))} parameters that require a gradient and are held by policy.optimizer. Check for "
+            "no_grad or detach in the policy, frozen layers, and layers that the optimizer does not hold"
         )
     return parameters
 
@@ -182,7 +182,7 @@ def score_factors(
         if isinstance(policy.action_dist, DiagGaussianDistribution):
             log_std = [policy.log_std.detach().expand_as(logits).clone().requires_grad_()]
         log_prob = policy.action_dist.proba_distribution(logits, *log_std).log_prob(actions)
-        # δ = ∂ log π / ∂z, of each step since log π of a step depends on its own z alone
+        # The gradient of the sum has δ = ∂ log π / ∂z of each step, since log π of a step depends on its z alone
         deltas = th.autograd.grad(log_prob.sum(), [*outputs, *log_std])
     factors: dict[th.Tensor, Factors] = {}
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]

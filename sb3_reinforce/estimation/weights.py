@@ -100,7 +100,7 @@ def without_rounding(differences: th.Tensor, numbers: th.Tensor) -> th.Tensor:
 
 
 def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:
-    """``γ^t (G_t − b_t)`` of the used steps in a row, shape ``(n,)``, float32; γ^t only with ``discount_scores``."""
+    """``γ^t (G_t − b_t)`` of the n used steps, shape ``(n,)``, float32; γ^t only with ``discount_scores``."""
     device = rollout.actions.device
     weights: th.Tensor = select(th.as_tensor(advantages, device=device), rollout.used)
     if normalize:
@@ -119,7 +119,7 @@ def standardize(weights: th.Tensor) -> th.Tensor:
 @dataclass(frozen=True)
 class Batch:
     """
-    The ``n`` used steps of a rollout in a row, as ``train`` takes them.
+    The ``n`` used steps of a rollout, flattened to ``(n, ...)``, as ``train`` takes them.
 
     ``observations`` are the rows of sequences for a recurrent policy.
     ``weights`` are γ^t (G_t − b_t) and ``returns`` what the critic is fitted to, float32; ``values`` are V(s_t) before
@@ -171,7 +171,7 @@ def check_used(used: Bools) -> None:
 
 
 def check_baseline(baseline: Any, rollout: Rollout) -> th.Tensor:
-    """b_t, 0 at unused steps, float64, on the CPU; an error unless a tensor of shape ``(n_steps, n_envs)``, finite."""
+    """Check that b_t is a tensor ``(n_steps, n_envs)``, finite at used steps; return it as float64, 0 elsewhere."""
     if not isinstance(baseline, th.Tensor):
         raise TypeError(f"baseline must return a tensor, got {type(baseline).__name__}")
     if baseline.shape != rollout.returns.shape:

@@ -37,8 +37,8 @@ def calls(policy: ActorCriticPolicy, method: str, with_values: bool = False) -> 
     Whether a method, ``forward`` or ``evaluate_actions``, is called instead of ``get_distribution`` (and, with values,
     ``predict_values``).
 
-    Both compute the features that actor and critic share only once, but bypass a user's ``get_distribution`` and
-    ``predict_values``.
+    It is where it has a user's code or hooks, and with values also where it saves a pass through a trained extractor
+    that actor and critic share, unless a user has overridden the other two. A recurrent policy has other methods.
     """
     if isinstance(policy, RecurrentPolicy):
         return False

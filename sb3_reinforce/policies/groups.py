@@ -12,8 +12,8 @@ class ParameterGroups:
     What log π depends on, what only V depends on, and what both do (a shared features extractor).
 
     They are read from graphs, not from names: a layer that computes π and V in one tensor counts as shared. They are
-    read once for the same trainable parameters. What that rollout does not reach belongs to actor and critic: a network
-    may use a part of itself in each rollout.
+    read again only when the set of trainable parameters changes. A parameter that neither log π nor V reaches in this
+    rollout belongs to actor and critic, since a network may use different parts in different rollouts.
     """
 
     def __init__(self) -> None:

@@ -115,13 +115,13 @@ def sizes_of(action_space: spaces.Space[Any]) -> list[int]:
 
 
 def without_mask(parts: dict[str, Part]) -> Part | dict[str, Part]:
-    """What there was before ``ActionMaskObservation`` of the parts of an observation, or of their spaces."""
+    """Undo ``ActionMaskObservation``: the observation without its mask, or the same for spaces."""
     rest = {key: part for key, part in parts.items() if key != KEY}
     return rest[OBSERVATION] if rest.keys() == {OBSERVATION} else rest
 
 
 def split_mask(features: th.Tensor, n_actions: int) -> tuple[th.Tensor, th.Tensor]:
-    """Features ``(..., n_features)`` and the mask ``(..., n_actions)`` that stands behind them."""
+    """Features ``(..., n_features)`` and the mask ``(..., n_actions)`` that is appended to them."""
     return features[..., :-n_actions], features[..., -n_actions:]
 
 
@@ -168,7 +168,7 @@ class MaskedLogits(nn.Module):
 
     def forward(self, latent: th.Tensor) -> th.Tensor:
         latent, mask = split_mask(latent, sum(self.sizes))
-        # Else π would be NaN in terminal states, and for the zeros by which a policy is probed
+        # Where nothing is allowed, as in terminal states, log π would round to 0 for every action: all logits are equal
         allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), self.sizes, dim=-1)]
         logits: th.Tensor = self.action_net(latent)
         return logits.masked_fill(~th.cat(allowed, dim=-1), FORBIDDEN)
@@ -179,9 +179,9 @@ class MaskedPolicy(ActorCriticPolicy):
     An ``ActorCriticPolicy`` that never takes a masked action, for REINFORCE, FiniteDifference, A2C, PPO and TRPO.
 
     π is the softmax over the actions that ``observation["action_mask"]`` allows (see ``ActionMaskObservation``);
-    log π, its gradient and the entropy belong to that distribution. Where nothing is allowed, as in terminal states,
-    all actions are. The critic and the features do not see the mask. A2C, PPO and TRPO need action spaces that start
-    at 0.
+    log π, its gradient and the entropy belong to that distribution. Where the mask allows nothing, as in terminal
+    states, all actions are allowed. The critic and the features do not see the mask. A2C, PPO and TRPO need action
+    spaces that start at 0.
 
     :param observation_space: A ``Dict`` with the key ``"action_mask"`` and at least one more
     :param action_space: ``Discrete`` or ``MultiDiscrete``
@@ -190,7 +190,7 @@ class MaskedPolicy(ActorCriticPolicy):
         ``"observation"`` if nothing else is there, else of the dict. None for the extractor of MlpPolicy, CnnPolicy or
         MultiInputPolicy, whichever fits
     :param kwargs: As for ``ActorCriticPolicy``
-    :raises ValueError: If the spaces are others
+    :raises ValueError: If the observation or action space does not have this form
     """
 
     def __init__(
@@ -205,9 +205,8 @@ class MaskedPolicy(ActorCriticPolicy):
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {}
         if parts.get(KEY) != spaces.MultiBinary(n_actions) or len(parts) == 1:
             raise ValueError(
-                f"observation_space must be a Dict of observations and {KEY!r}: MultiBinary({n_actions}) with "
-                f"MaskedPolicy (wrap the environment in ActionMaskObservation, or declare its mask like this), got "
-                f"{observation_space}"
+                f"MaskedPolicy needs an observation_space that is a Dict with {KEY!r}: MultiBinary({n_actions}) and at "
+                f"least one more key, got {observation_space}: wrap the environment in ActionMaskObservation"
             )
         if features_extractor_class is None:
             features_extractor_class = extractor_class_for(without_mask(parts))

@@ -73,8 +73,9 @@ def natural_step(
         # Leaves no graph in the policy, which could not be deep-copied with one
         measured(divergence)
         warnings.warn(
-            "The natural step is left out, and the parameters are those before it: no step was found that changes the "
-            "policy by target_kl. Mostly the policy is almost deterministic; ent_coef, temperature or min_std may help",
+            "The natural step is left out, and the parameters are unchanged: no step with a KL divergence of about "
+            f"target_kl={target_kl:.2g} was found. Usually the policy is almost deterministic: raise ent_coef, and "
+            "temperature (discrete actions) or min_std (Box actions)",
             stacklevel=2,
         )
         return norm, 0.0

@@ -72,7 +72,7 @@ class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy
 
 
 class BesideMask(th.nn.Module):
-    """A layer that the mask behind its inputs bypasses."""
+    """A layer whose inputs end with a mask: it computes the rest, and appends the mask to its outputs."""
 
     def __init__(self, layer: th.nn.Module, n_actions: int):
         super().__init__()

@@ -24,8 +24,9 @@ from sb3_reinforce.policies.memories import MEMORIES, State, check_memory, initi
 # "observations"; "sequence" of shape (n,); and "state" of shape (n, 2, 2, n_layers, n_hidden), for actor and critic,
 # hidden and cell state, unless all sequences start from zero; "features" where they are known already
 Rows: TypeAlias = dict[str, Any]
-# Floats that the gates of padded sequences may take, 64 MiB, and what an LSTM keeps of each hidden unit and step
+# Floats that the gates of padded sequences may take, 64 MiB
 FLOATS = 2**24
+# Floats that an LSTM keeps for each hidden unit and step
 GATES = 8
 LSTM_ARGUMENTS = ("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm")
 
@@ -65,7 +66,7 @@ class RecurrentPolicy(ActorCriticPolicy):
         return super()._get_constructor_parameters() | self.memory_arguments
 
     def _build(self, lr_schedule: Schedule) -> None:
-        # PyTorch's memories take no NumPy integer, which it is for MultiDiscrete observations
+        # For MultiDiscrete observations it is a NumPy integer, which PyTorch's recurrent layers do not take
         self.features_dim = int(self.features_dim)
         super()._build(lr_schedule)
 
@@ -85,7 +86,7 @@ class RecurrentPolicy(ActorCriticPolicy):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions and the next state; observation and state are checked first."""
         if isinstance(observation, tuple):
-            raise ValueError("observation must not be a tuple: Gymnasium's reset returns the observation and an info")
+            raise ValueError("observation must not be a tuple: reset returns (observation, info), pass the first only")
         obs, _ = self.obs_to_tensor(observation)
         n_layers, _, n_hidden = self.lstm_hidden_state_shape
         n_envs = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)

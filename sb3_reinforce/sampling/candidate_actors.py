@@ -23,7 +23,7 @@ from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
 
 
 class LoopActor:
-    """The policy's own ``predict``, in one environment after the other; a candidate is in it only while it predicts."""
+    """Calls ``predict`` in one environment after the other; candidates are written to the policy for the call only."""
 
     # A deep copy would not do: hooks and replaced methods may refer to the policy that they were made for, and policies
     # that hold a graph, as with gSDE, cannot be copied

@@ -1,9 +1,10 @@
 """
 Many parameter vectors evaluated side by side in one VecEnv.
 
-The queue of (candidate, episode) pairs is fixed before the first step, or short episodes would be sampled more often.
-With seeds it is worked off in rounds, whose pairs start together from the seeds of their episodes: a VecEnv's resets at
-the end of episodes have no seed. Without seeds an environment whose episode ends takes the next pair.
+The queue of (candidate, episode) pairs is fixed before the first step; otherwise short episodes would be sampled more
+often. With seeds, the queue is processed in rounds. All pairs of a round start together, each from the seed of its
+episode: the resets that a VecEnv makes at the end of episodes have no seed. Without seeds, an environment whose episode
+ends takes the next pair.
 """
 
 import math
@@ -58,8 +59,8 @@ class EpisodeTracker:
         if self.clock > self.deadline:
             raise ValueError(
                 f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps: give the "
-                "environment a time limit, or raise max_episode_steps. An EvalCallback needs other environments. "
-                "The parameters have not changed."
+                "environment a time limit, or raise max_episode_steps. If an EvalCallback uses the same environments, "
+                "give it separate ones. The parameters have not changed."
             )
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
@@ -146,9 +147,9 @@ def compare_with_earlier(met: dict[int, Any], seeds: np.ndarray, obs: Any) -> No
         one = take(obs, [env])
         if not are_alike(stack([met.setdefault(seed, one), one]), size=2):
             warnings.warn(
-                "Common random numbers do not reduce the noise here: after reset(seed=...) with the same seed and "
-                "another reset, the observations differ. Let the environment draw all random numbers from "
-                "self.np_random, or give FiniteDifference common_random_numbers=False",
+                "Common random numbers do not reduce the noise here: environments reset with the same seed, and then "
+                "once more without a seed, return different observations. Let the environment draw all random numbers "
+                "from self.np_random, or give FiniteDifference common_random_numbers=False",
                 stacklevel=3,
             )
             return

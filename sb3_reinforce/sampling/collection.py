@@ -59,9 +59,9 @@ class Extent:
         """Refuse an episode that never ends."""
         if n_steps == self.deadline:
             raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and whole episodes "
-                "are waited for: give the environment a time limit, raise max_episode_steps, or, to train, set "
-                "n_steps. An EvalCallback needs other environments"
+                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and the rollout "
+                "waits for whole episodes: give the environment a time limit, raise max_episode_steps, or train with "
+                "n_steps instead of n_episodes. If an EvalCallback uses the same environments, give it separate ones"
             )
 
     def count(self, dones: Bools, n_steps: int) -> list[int]:
@@ -96,7 +96,7 @@ def collect(
     has_values = calls(policy, "forward", with_critic)
     actor = actor_of(has_values, is_attached)
     as_env_actions = env_actions_of(policy)
-    # Which steps are the first of an episode; all rows but the first are also ``dones``
+    # Row t: which environments start an episode at step t. From row 1 on, it is ``dones`` of the step before
     starts = [cast(Bools, model._last_episode_starts)]
     terminal_obs: TerminalObs = {}
     n_steps = 0
@@ -120,7 +120,7 @@ def collect(
                 if not callback.on_step():
                     return None
         finally:
-            # As with A2C the callback finds s_t; where it fails, s_{t+1} is checked
+            # As with A2C, the callback finds s_t here. If it fails, s_{t+1} is kept
             model._last_obs = new_obs  # type: ignore[assignment]
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
@@ -153,7 +153,7 @@ def collect(
 
 
 def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:
-    """Store fractions where a Box has an integer dtype: ``VecNormalize`` and a Gaussian policy return floats."""
+    """Make arrays float32 where a Box has an integer dtype, since VecNormalize and Gaussian policies return floats."""
 
     def fitted(rows: np.ndarray, given: Any) -> np.ndarray:
         gives_fractions = np.asarray(given).dtype.kind == "f" and rows.dtype.kind != "f"

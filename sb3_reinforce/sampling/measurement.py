@@ -27,7 +27,7 @@ def undisturbed(model: BaseAlgorithm) -> Iterator[None]:
     """Use a model's environments with VecNormalize frozen; the model then goes on from the start of an episode."""
     if getattr(model, "is_collecting", False):
         raise ValueError(
-            "model is collecting a rollout, whose episodes a measurement in the same environments would cut: call it "
+            "model is collecting a rollout, and a measurement in the same environments would cut its episodes: measure "
             "in on_rollout_end, or after training"
         )
     env = cast(VecEnv, model.env)

@@ -28,7 +28,7 @@ KEEP_REWARDS = {
 
 
 class ObservationStatistics:
-    """Statistics of the observations below a frozen VecNormalize, as long as it would learn."""
+    """The statistics of observations that a frozen VecNormalize would have learned if it were not frozen."""
 
     def __init__(self, vec_normalize: VecNormalize):
         self.vec_normalize = vec_normalize
@@ -68,9 +68,13 @@ def check_scale(env: VecEnv | None) -> None:
     """Refuse a VecNormalize whose scale of the rewards is used, but would never be learned."""
     learning = [each for each in normalizers(env) if each.training and each.norm_reward]
     if learning and env is not None and original_reward_of(env) is None:
+        changing = env
+        while isinstance(changing, VecNormalize) or type(changing).step_wait in KEEP_REWARDS:
+            changing = cast(VecEnvWrapper, changing).venv
         raise ValueError(
-            "VecNormalize must have norm_reward=False, or training=False once its scale is learned, below a wrapper "
-            f"that may change rewards ({type(env).__name__}): while candidates are compared the scale stands still"
+            f"{type(changing).__name__} lies above VecNormalize and may change rewards. FiniteDifference compares "
+            "candidates at a frozen scale, which VecNormalize would never learn: set norm_reward=False, or "
+            "training=False once the scale is learned"
         )
 
 

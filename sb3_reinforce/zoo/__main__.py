@@ -178,8 +178,8 @@ def main() -> None:
         if command != "plot_from_file" or "empty sequence" not in str(error):
             raise
         parser.error(
-            "no algorithm has two runs with evaluations at the same steps: all_plots keeps only such runs, and with "
-            "--max-timesteps more of them"
+            "no algorithm has two runs with evaluations at the same steps. Pass a file from all_plots -o: all_plots "
+            "drops runs that are shorter than the longest one, unless --max-timesteps cuts all to a common length"
         )
 
 

@@ -140,7 +140,7 @@ def find_settings(experiment: Experiment) -> Settings:
     if experiment.model_config is not None:
         print(f"Continuing with the settings of the model: {experiment.model_config}")
         # The Zoo writes an OrderedDict, which safe_load refuses
-        return dict(yaml.unsafe_load(experiment.model_config.read_text()))
+        return dict(yaml.unsafe_load(experiment.model_config.read_text(encoding="utf-8")))
     config, env_id = experiment.config, experiment.env_name.gym_id
     print(f"Loading hyperparameters from: {config}")
     published = as_dict(f"The content of {config}", load_configuration(config))

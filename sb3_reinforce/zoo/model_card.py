@@ -12,10 +12,9 @@ from rl_zoo3 import ALGOS, utils
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import sb3_reinforce.zoo  # noqa: F401 registers the algorithms
 from sb3_reinforce.zoo.settings import ConfigurationError
 
-# Options of ``train`` that change the result, and their names in ``args.yml``; ``enjoy`` needs some of them
+# Options of ``train`` that change the result, and their names in ``args.yml``; ``enjoy`` needs some, and the run
 OPTIONS = {
     "--algo": "algo",
     "--env": "env",
@@ -27,6 +26,7 @@ OPTIONS = {
     "--env-kwargs": "env_kwargs",
     "--gym-packages": "gym_packages",
     "--trained-agent": "trained_agent",
+    "--exp-id": "exp_id",
 }
 OF_ENJOY = ("algo", "env", "log_folder", "gym_packages")
 
@@ -68,10 +68,10 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
     except (AssertionError, ValueError) as error:
         raise ConfigurationError(f"{error}: pass another folder, algorithm, environment or --exp-id") from error
     saved = Path(run, env_name)
-    arguments = yaml.unsafe_load((saved / "args.yml").read_text())
+    arguments = yaml.unsafe_load((saved / "args.yml").read_text(encoding="utf-8"))
     for package in arguments["gym_packages"]:
         importlib.import_module(package)
-    settings = dict(yaml.unsafe_load((saved / "config.yml").read_text()))
+    settings = dict(yaml.unsafe_load((saved / "config.yml").read_text(encoding="utf-8")))
     hyperparams, stats = utils.get_saved_hyperparams(str(saved), test_mode=True)
     env_kwargs = arguments["env_kwargs"] or settings.get("env_kwargs")
     # Not the seed of training, whose episodes the agent has seen
@@ -87,6 +87,8 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
         # The settings of the trial: others do not have its study
         arguments["hyperparams"] = settings
     path = Path(run, "README.md")
+    # The Zoo names a run ENV_NUMBER
+    number = path.parent.name.rpartition("_")[2]
     card = CARD.format(
         algorithm=type(agent).__name__,
         command=zoo_command("train", arguments),
@@ -96,9 +98,9 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
         seed=arguments["seed"],
         settings=yaml.dump(settings),
         std=std,
-        usage=zoo_command("enjoy", {each: arguments[each] for each in OF_ENJOY}),
+        usage=zoo_command("enjoy", {each: arguments[each] for each in OF_ENJOY} | {"exp_id": number}),
     )
-    path.write_text(card)
+    path.write_text(card, encoding="utf-8")
     return path
 
 

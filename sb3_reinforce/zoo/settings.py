@@ -48,7 +48,7 @@ def load_configuration(config: str) -> Any:
     """Load what a YAML file, a Python file or a module holds, as the Zoo does."""
     try:
         if config.endswith((".yml", ".yaml")):
-            return yaml.safe_load(Path(config).read_text())
+            return yaml.safe_load(Path(config).read_text(encoding="utf-8"))
         names = runpy.run_path(config) if config.endswith(".py") else vars(importlib.import_module(config))
     except (OSError, SyntaxError, yaml.YAMLError) as error:
         raise ConfigurationError(f"{config} cannot be read: {error}") from error
@@ -92,7 +92,8 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
         if isinstance(value, str):
             if re.fullmatch(r"[-+\d.]+e[-+\d]+", value, re.IGNORECASE):
                 raise ConfigurationError(
-                    f"{key} is the text {value!r}: write !!float {value} in YAML, and {value} in -params"
+                    f"{key} must be a number, got the string {value!r}: write !!float {value} in YAML, and {value} "
+                    "without quotes in -params"
                 )
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")

@@ -20,7 +20,7 @@ from sb3_reinforce.sampling.candidates import seeds_of
 
 def test_an_estimate_before_learn_is_refused():
     model = make(Line())
-    with pytest.raises(ValueError, match=r"estimate_gradient needs the counters and the log of learn\(\)"):
+    with pytest.raises(ValueError, match=r"call learn\(0\) first"):
         model.estimate_gradient(Record(lambda model: None))
 
 

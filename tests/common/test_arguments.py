@@ -180,7 +180,7 @@ RECURRENT, MASKABLE = (
         ("steps", {"use_sde": True}, ["use_sde=True", "Box", "Discrete"]),
         ("search", {"estimator": "regression", "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
         ("search", {"estimator": ESTIMATORS["regression"], "n_delta": 1}, ["n_delta", "at least 2", "'regression'"]),
-        ("search", {"n_top": 4}, ["n_top=4", "n_delta=2"]),
+        ("search", {"n_top": 4}, ["n_top must be at most n_delta=2", "got 4"]),
         ("search", {"n_top": 1, "estimator": "forward"}, ["n_top=1", "'central'", "'forward'"]),
         ("search", {"policy": th.nn.Linear}, ["policy", "ActorCriticPolicy", "Linear"]),
         ("steps", {"policy": SACPolicy}, ["policy", "ActorCriticPolicy", "SACPolicy"]),

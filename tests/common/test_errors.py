@@ -96,7 +96,7 @@ EXPLODING = {
 def test_a_step_to_parameters_that_are_not_finite_is_undone(kind, tmp_path):
     env, arguments = EXPLODING[kind]
     model = make(kind, env, **arguments)
-    with pytest.raises(ValueError, match=r"made a parameter of the policy that is not finite.*optimizer_kwargs"):
+    with pytest.raises(ValueError, match=r"update of the policy left a parameter that is not finite.*optimizer_kwargs"):
         model.learn(4000)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     model.save(tmp_path / "model")
@@ -106,7 +106,7 @@ def test_a_step_to_parameters_that_are_not_finite_is_undone(kind, tmp_path):
 def test_a_critic_whose_passes_end_in_parameters_that_are_not_finite_keeps_those_before():
     model = make("steps", learning_rate=0.0, critic_learning_rate=1e3, **optimizer(weight_decay=1e38))
     before = plain(model.policy.state_dict())
-    with pytest.raises(ValueError, match="made a parameter of the critic that is not finite"):
+    with pytest.raises(ValueError, match="update of the critic left a parameter that is not finite"):
         model.learn(8)
     assert plain(model.policy.state_dict()) == before
 

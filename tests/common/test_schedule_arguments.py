@@ -16,9 +16,9 @@ def test_forms_that_stand_for_the_value_of_a_schedule(form, kind):
 @pytest.mark.parametrize(("kind", "name"), [("steps", "temperature"), ("search", "delta_std")])
 def test_a_schedule_may_fall_to_an_excluded_bound_but_not_start_there(kind, name):
     for schedule in (lambda progress: 0.0, lambda progress: 1 - progress):
-        with pytest.raises(ValueError, match=rf"{name} \(at progress 1\) must be (in \(0|finite and > 0)"):
+        with pytest.raises(ValueError, match=rf"{name} \(at progress_remaining=1\) must be (in \(0|finite and > 0)"):
             make(kind, **{name: schedule})
-    with pytest.raises(ValueError, match=rf"{name} \(at progress 0\) must be (in \[0|finite and >= 0)"):
+    with pytest.raises(ValueError, match=rf"{name} \(at progress_remaining=0\) must be (in \[0|finite and >= 0)"):
         make(kind, **{name: lambda progress: 2 * progress - 1})
     make(kind, **{name: lambda progress: progress}).learn(8)
 

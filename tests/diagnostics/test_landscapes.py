@@ -121,7 +121,7 @@ def test_a_landscape_around_zero_has_no_scale():
     model = bandit()
     for parameter in model.policy.parameters():
         parameter.data.zero_()
-    with pytest.raises(ValueError, match="not all 0"):
+    with pytest.raises(ValueError, match="parameters are all 0"):
         landscape(model, 10)
 
 
@@ -290,7 +290,7 @@ UNDRAWN = [np.ones((1, 8)), np.ones((3, 7)), np.ones(8)]
     [
         (plots.plot_baselines, (3,), "table must be the Table that compare_baselines returns, got 3"),
         (plots.plot_baselines, (Table("", [Estimate(0.0, 0.0, 0.0)], {}),), "BaselineRow of compare_baselines"),
-        (plots.plot_landscape, (3,), "scape must be Landscape, got 3"),
+        (plots.plot_landscape, (3,), "scape must be the Landscape that landscape returns, got 3"),
         (plots.plot_learning_curves, ([1], [1]), "runs must be a dictionary"),
         (plots.plot_learning_curves, ({}, [1]), "runs must have at least one array"),
         *((plots.plot_learning_curves, ({"a": wrong}, np.arange(8)), r"runs\['a'\]") for wrong in UNDRAWN),

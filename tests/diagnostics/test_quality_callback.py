@@ -150,7 +150,11 @@ def average(name):
 
 @pytest.mark.parametrize(
     ("baselines", "message"),
-    [("timemean", "did you mean 'time_mean'"), ([3], "a name or a callable"), ((average("none"),), "another row")],
+    [
+        ("timemean", "did you mean 'time_mean'"),
+        ([3], "a name or a callable"),
+        ((average("none"),), "names that differ"),
+    ],
 )
 def test_wrong_baselines_are_refused_before_learn_resets_its_counters(baselines, message):
     with pytest.raises((TypeError, ValueError), match=message):

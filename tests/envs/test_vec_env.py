@@ -332,7 +332,7 @@ def test_episodes_that_gymnasium_records():
         RecordEpisodeStatistics(SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=mode))
         for mode in modes
     ]
-    with pytest.raises(ValueError, match="use VecMonitor"):
+    with pytest.raises(ValueError, match="wrap the GymnasiumVecEnv in VecMonitor"):
         GymnasiumVecEnv(recorders[1])
     env = GymnasiumVecEnv(recorders[0])
     env.seed(0)
@@ -385,7 +385,7 @@ def test_only_gymnasiums_own_cart_pole_is_reset_within_the_step():
 @pytest.mark.parametrize("wrapper", [lambda env: env, VectorWrapper])
 def test_a_wrapper_that_forgets_the_episodes_that_go_on_is_refused(wrapper):
     env = SyncVectorEnv([lambda: Corridor((2, 3, 5))] * N_ENVS, autoreset_mode=AutoresetMode.DISABLED)
-    with pytest.raises(ValueError, match="use VecNormalize"):
+    with pytest.raises(ValueError, match="wrap the GymnasiumVecEnv in VecNormalize"):
         GymnasiumVecEnv(wrapper(NormalizeReward(env)))
 
 

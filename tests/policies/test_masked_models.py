@@ -194,8 +194,8 @@ def test_a_user_may_build_another_network():
     ],
 )
 def test_a_masked_policy_needs_masks_and_observations(space, algorithm):
-    expected = r"observation_space must be .*'action_mask': MultiBinary\(2\).*ActionMaskObservation.*got "
-    with pytest.raises(ValueError, match=expected + re.escape(str(space))):
+    expected = r"observation_space that is a Dict with 'action_mask': MultiBinary\(2\) .*, got "
+    with pytest.raises(ValueError, match=expected + re.escape(f"{space}: wrap the environment in ActionMask")):
         make(algorithm, Random(space))
 
 

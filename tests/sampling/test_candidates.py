@@ -291,8 +291,8 @@ def test_the_rewards_are_those_below_vec_normalize_and_above_other_wrappers(wrap
 
 def test_a_scale_that_is_never_learned_is_refused():
     """While candidates are compared, a VecNormalize learns nothing: it would clip rewards of any size to ±10."""
-    env = Shifted(VecNormalize(DummyVecEnv([Counting])))
-    with pytest.raises(ValueError, match=r"norm_reward=False, .* below a wrapper .* \(Shifted\)"):
+    env = VecMonitor(Shifted(VecNormalize(DummyVecEnv([Counting]))))
+    with pytest.raises(ValueError, match=r"Shifted lies above VecNormalize .* set norm_reward=False"):
         FiniteDifference("LinearPolicy", env, n_delta=4, seed=0).learn(1)
 
 

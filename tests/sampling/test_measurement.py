@@ -97,7 +97,7 @@ def test_a_measurement_in_the_middle_of_a_rollout_is_refused(kind):
             return True
 
     def refused(model):
-        with pytest.raises(ValueError, match=r"model is collecting a rollout.*call it in on_rollout_end"):
+        with pytest.raises(ValueError, match=r"model is collecting a rollout.*measure in on_rollout_end"):
             measure(model)
 
     starts, ends = Record(measure, "rollout_start"), Record(measure, "rollout_end")

@@ -60,7 +60,7 @@ def test_a_model_card_describes_the_last_agent(name, folder):
     assert yaml.safe_load(metadata)["library_name"] == "stable-baselines3"
     assert f"**{ALGORITHMS[name].__name__}** Agent playing **CartPole-v1**" in text
     assert re.search(r"2 deterministic episodes, after training with seed 1: \*\*\d+\.\d\d ± \d+\.\d\d\*\*", text)
-    assert f"enjoy --algo {name} --env CartPole-v1 -f logs\n" in text and "-n 400 -f logs --seed 1" in text
+    assert f"enjoy --algo {name} --env CartPole-v1 -f logs --exp-id 2\n" in text and "-n 400 -f logs --seed 1" in text
     settings = text.partition("```yaml\n")[2].partition("```")[0]
     assert yaml.safe_load(settings) == config_of(card.parent)
 
@@ -338,7 +338,7 @@ def test_plots_of_runs_that_cannot_be_compared_say_what_to_do(monkeypatch, capsy
     module = importlib.import_module("rl_zoo3.plots.plot_from_file")
     fail = mock.Mock(side_effect=ValueError("min() arg is an empty sequence"))
     monkeypatch.setattr(module, "plot_from_file", fail)
-    assert "all_plots keeps only such runs, and with --max-timesteps" in message_of(capsys, "plot_from_file", "-i", "x")
+    assert "all_plots drops runs that are shorter" in message_of(capsys, "plot_from_file", "-i", "x")
 
 
 def test_a_missing_tensorboard_is_named(tmp_path, monkeypatch, capsys):
