@@ -116,8 +116,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
-    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; it can be a schedule. If it
-        falls to 0, training ends with nearly the deterministic policy that ``evaluate_policy`` measures by default
+    :param temperature: τ in π(a|s) ∝ exp(logits / τ), for discrete actions; below 0.001 it acts as 0.001. It can be a
+        schedule: if it falls to 0, training ends with nearly the deterministic policy that ``evaluate_policy`` measures
+        by default
     :param min_std: Floor under the standard deviation of a Gaussian policy (with gSDE, of its noise weights), restored
         after each step; 0 for no floor. It can be a schedule: if it falls to 0, the policy explores at first, and its
         noise may shrink later
@@ -315,10 +316,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         rollout_buffer.reset()
         n_steps = self.n_steps
         callback.on_rollout_start()
-        # The user or a callback may have changed the environments and arguments
+        # The user or a callback may have changed the environments, the policy and arguments
         env = cast(VecEnv, self.env)
         check_reinforce(self)
         check_starts(self)
+        self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)

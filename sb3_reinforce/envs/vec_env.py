@@ -58,7 +58,7 @@ class GymnasiumVecEnv(VecEnv):
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        observations: VecEnvObs = map_parts(np.array, obs)
+        observations: VecEnvObs = copied(self.observation_space, obs)
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -105,8 +105,7 @@ class GymnasiumVecEnv(VecEnv):
                 check_batch(self.observation_space, obs, self.num_envs)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
-        # A copy: the environment may write its next observations into the same arrays
-        return map_parts(np.array, obs), rewards.astype(np.float32), dones, infos
+        return copied(self.observation_space, obs), rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
         """Close the vector environment."""
@@ -229,6 +228,13 @@ def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
     share_form = isinstance(space, spaces.Box) and (rows.dtype.kind != "f" or np.dtype(space.dtype).kind == "f")
     for i in range(1 if share_form else n_envs):
         check_observation(space, rows[i], i)
+
+
+def copied(space: spaces.Space[Any], obs: Any) -> Any:
+    """A copy without keys that the space lacks: environments may write the next observations into the same arrays."""
+    if isinstance(space, spaces.Dict):
+        return {key: copied(part, obs[key]) for key, part in space.spaces.items()}
+    return np.array(obs)
 
 
 def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:

@@ -212,7 +212,7 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     if hook is None:
         if temperature == 1:
             return
-        hook = DivideLogits(th.ones((), device=policy.device))
+        hook = DivideLogits(th.ones((), dtype=th.float32, device=policy.device))
         layer.register_forward_hook(hook)
     hook.temperature.fill_(max(temperature, MIN_TEMPERATURE))
 

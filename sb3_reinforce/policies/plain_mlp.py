@@ -53,7 +53,8 @@ class DivideLogits:
 
     def __call__(self, module: nn.Module, inputs: Any, logits: th.Tensor) -> th.Tensor:
         """``logits / τ``."""
-        return logits / self.temperature
+        # The policy may have been moved since
+        return logits / self.temperature.to(logits.device)
 
 
 def hooks_of(module: nn.Module) -> list[Any]:

@@ -161,7 +161,7 @@ def sampler_of(policy: ActorCriticPolicy, n_envs: int) -> Callable[[Float32s], n
 
 def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[Float32s], Float32s]:
     """``a = mean + σ ε`` with normal ε."""
-    noise = th.empty(n_envs, width)
+    noise = th.empty(n_envs, width, dtype=th.float32)
     epsilon = noise.numpy()
     log_sigma = log_std.detach().numpy()
     sigma = np.empty_like(log_sigma)
@@ -177,7 +177,7 @@ def gaussian_sampler(log_std: th.Tensor, n_envs: int, width: int) -> Callable[[F
 
 def categorical_sampler(n_envs: int, n_actions: int) -> Callable[[Float32s], np.ndarray]:
     """``a = argmax_i (logits_i − log E_i)`` with exponential E: the Gumbel-max trick (Gumbel, 1954)."""
-    noise = th.empty(n_envs, n_actions)
+    noise = th.empty(n_envs, n_actions, dtype=th.float32)
     scores = noise.numpy()
 
     def sample(logits: Float32s) -> Any:

@@ -273,6 +273,25 @@ def test_malformed_observations_of_resets_are_named(at_first):
         make("steps", env).learn(100)
 
 
+class Noted(SyncVectorEnv):
+    """Returns more than its space has."""
+
+    def reset(self, **kwargs):
+        obs, infos = super().reset(**kwargs)
+        return obs | {"note": "reset"}, infos
+
+    def step(self, actions):
+        obs, *rest = super().step(actions)
+        return obs | {"note": "step"}, *rest
+
+
+def test_what_a_dict_has_besides_its_space_is_left_out():
+    space = spaces.Dict({"x": spaces.Box(-1, 1, (2,))})
+    env = synced(lambda: Random(space), vector_env=Noted)
+    assert env.reset().keys() == step(env)[0].keys() == {"x"}
+    assert REINFORCE("MultiInputPolicy", env, device="cpu").learn(64).num_timesteps >= 64
+
+
 class Numbers(SyncVectorEnv):
     """Ends episodes by numbers, and resets copies as vectorized environments do, by a mask of an array."""
 

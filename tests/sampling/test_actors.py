@@ -5,9 +5,10 @@ from itertools import product
 import numpy as np
 import pytest
 import torch as th
-from callbacks import At
+from callbacks import At, Record
 from environments import Corridor
 from gymnasium import spaces
+from models import plain
 from policy_changes import BODY, CHANGES, EXTRACTOR
 from stable_baselines3.common.distributions import CategoricalDistribution, SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
@@ -66,6 +67,31 @@ class OwnForward(ActorCriticPolicy):
 
     def forward(self, obs, deterministic=False):
         return super().forward(obs, deterministic)
+
+
+@pytest.mark.parametrize("dtype", [th.float64, th.bfloat16])
+@pytest.mark.parametrize("space", (SPACES[0], SPACES[3]), ids=str)
+def test_a_run_does_not_depend_on_the_default_dtype(space, dtype):
+    ends = []
+    for each in (th.float32, dtype):
+        model = REINFORCE("MlpPolicy", Corridor((3, 5), action_space=space), seed=0, device="cpu")
+        th.set_default_dtype(each)
+        try:
+            model.learn(64)
+        finally:
+            th.set_default_dtype(th.float32)
+        ends.append(plain(model.policy.state_dict()))
+    assert ends[0] == ends[1]
+
+
+def test_a_policy_that_a_callback_puts_in_training_mode_acts_in_evaluation_mode():
+    modes = []
+    model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu")
+    model.policy.action_net.register_forward_hook(
+        lambda module, *_: modes.append((model.is_collecting, module.training))
+    )
+    model.learn(16, Record(lambda model: model.policy.set_training_mode(True), "rollout_start"))
+    assert {training for is_collecting, training in modes if is_collecting} == {False}
 
 
 @pytest.mark.parametrize("space", (SPACES[0], SPACES[3]), ids=str)
