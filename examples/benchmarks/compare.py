@@ -158,6 +158,11 @@ def train(final_episodes: int, params: dict[str, Any] | None, run: Run) -> tuple
     return run, evaluations.rows
 
 
+def ignore_interrupts() -> None:
+    """Ctrl-C is the main process's to answer."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def finished(path: Path) -> set[tuple[Any, ...]]:
     """The runs that a CSV has the last row of."""
     if not path.exists():
@@ -204,9 +209,8 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         map_runs: Any = map
         if is_alone:
-            # Ctrl-C is the main process's to answer
-            ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(arguments.processes, **ignore))
+            context = multiprocessing.get_context("spawn")
+            pool = stack.enter_context(context.Pool(arguments.processes, ignore_interrupts))
             map_runs = pool.imap_unordered
         elif not is_leader():
             runs = [run for run in runs if run.algorithm in OURS]

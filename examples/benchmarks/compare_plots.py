@@ -101,7 +101,7 @@ def seeds(counts: Collection[int]) -> str:
 
 
 def color(algorithm: str) -> str:
-    # The last two are never in a picture with the first
+    # RecurrentPPO has REINFORCE's color, and is in no picture with it
     return COLORS[list(LABELS).index(algorithm) % len(COLORS)] if algorithm in LABELS else "black"
 
 

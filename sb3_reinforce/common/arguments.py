@@ -101,17 +101,17 @@ class CheckedSchedule(FloatSchedule):
     """
     A number ≥ 0, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    With ``above`` a value may be 0 only at the end of training, or with ``may_reach`` anywhere after its start.
+    With ``above`` a value may be 0 only at the end of training, or with ``may_reach_zero`` anywhere after its start.
     """
 
-    def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach: bool = False):
+    def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach_zero: bool = False):
         check_kind(name, schedule, (Real, Callable), "a number or a schedule")
         super().__init__(schedule if callable(schedule) else check_number(name, schedule, 0, high, above))
         self.given = schedule
         self.check = partial(check_number, low=0, high=high)
         self.name = name
         self.above = above
-        self.may_reach = may_reach
+        self.may_reach_zero = may_reach_zero
         for progress_remaining in (1.0, 0.0):
             self(progress_remaining)
 
@@ -122,7 +122,7 @@ class CheckedSchedule(FloatSchedule):
             # A LinearSchedule that ends at 0 may end below it by rounding
             value = 0.0
         # At the end of training nothing is drawn any more
-        is_excluded = progress_remaining == 1 if self.may_reach else progress_remaining > 0
+        is_excluded = progress_remaining == 1 if self.may_reach_zero else progress_remaining > 0
         where = f"{self.name} (at progress_remaining={progress_remaining:g})"
         return self.check(where, value, above=self.above and is_excluded)
 

@@ -187,7 +187,7 @@ class BasePolicyGradient(Distributed):
             env = check_env(env, verbose=0)
         n_envs = None if env is None else getattr(env, "num_envs", 1)
         given = {**(custom_objects or {}), **kwargs}
-        kwargs |= storage.left_open(saved, given.keys() - LOAD_ARGUMENTS, n_envs)
+        kwargs |= storage.defaults_to_choose_again(saved, given.keys() - LOAD_ARGUMENTS, n_envs)
         model = super().load(path, env, device, custom_objects, *args, **kwargs)
         if restore_random_state:
             storage.restore_generators(model._random_state, model.device)
@@ -221,9 +221,9 @@ class BasePolicyGradient(Distributed):
         From a file only tensors are read (``weights_only``): no code in it is run.
 
         :param load_path_or_dict: A saved model, or what ``get_parameters`` of a model returns
-        :param exact_match: Whether the states must be exactly those that ``get_parameters`` returns here. If False, a
-            state of another kind of optimizer, and missing or unknown parameters, are left out with a warning; without
-            all parameters of the policy, its optimizer's state is too. FiniteDifference ignores ``critic_optimizer``
+        :param exact_match: Whether names must be those of ``get_parameters`` here. If False, what is missing stays, and
+            unknown parameters and the state of another kind of optimizer are left out, with a warning; so are all
+            optimizers' states if the policy's names differ. FiniteDifference ignores ``critic_optimizer``
         :param device: Device on which the parameters are loaded
         :raises TypeError: If an argument is of the wrong type, or a state is not a dict
         :raises ValueError: If names do not match, a number is not finite, or a state belongs to another optimizer or

@@ -122,7 +122,7 @@ REINFORCE_ARGUMENTS: dict[str, Check] = COMMON_ARGUMENTS | {
     "n_critic_updates": check_count,
     "batch_size": check_count,
     "critic_learning_rate": optional(partial(CheckedSchedule, high=MAX_LEARNING_RATE)),
-    "temperature": partial(CheckedSchedule, above=True, may_reach=True, high=MAX_TEMPERATURE),
+    "temperature": partial(CheckedSchedule, above=True, may_reach_zero=True, high=MAX_TEMPERATURE),
     "min_std": partial(CheckedSchedule, high=MAX_STD),
     "use_sde": check_flag,
     "sde_sample_freq": partial(check_integer, low=-1),

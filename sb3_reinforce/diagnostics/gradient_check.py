@@ -24,7 +24,7 @@ from sb3_reinforce.diagnostics.tables import Table
 from sb3_reinforce.estimation.baselines import BASELINES, Baseline
 from sb3_reinforce.estimation.rollout import Rollout, used_inputs
 from sb3_reinforce.estimation.scores import gradients_by_episode, parameters_of
-from sb3_reinforce.estimation.weights import standardize, without_rounding
+from sb3_reinforce.estimation.weights import without_rounding
 from sb3_reinforce.policies.evaluation import log_prob_of
 from sb3_reinforce.policies.sequences import RecurrentPolicy
 from sb3_reinforce.reinforce import REINFORCE
@@ -86,7 +86,7 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
       ``log_std`` is left out. A policy that always samples the same action, or trains nothing but ``log_std``, cannot
       be checked, and does not pass.
     - ``returns`` and ``weights``: G_t and γ^t (G_t − b_t) follow from the rewards by their definitions. The model's
-      ``discount_scores`` and ``normalize_advantage`` count.
+      ``discount_scores`` and ``normalize_advantage`` are taken into account.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
     Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before
@@ -196,15 +196,20 @@ def return_error(collector: REINFORCE, rollout: Rollout) -> float:
 
 
 def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
-    """The relative difference of the weights of ``train()`` and γ^t (G_t − b_t), with t counted in each episode."""
+    """
+    The relative difference between the weights of ``train()`` and γ^t (G_t − b_t), normalized as the model does; γ^t
+    only with ``discount_scores`` and returns to go.
+    """
     baseline = collector.baseline
     values = baseline.values if isinstance(baseline, Recorded) else BASELINES[cast(str, baseline)](rollout)
     differences = without_rounding(rollout.returns - values.cpu(), rollout.returns).float()[rollout.used]
     expected = th.zeros_like(rollout.returns)
-    expected[rollout.used] = (standardize(differences) if collector.normalize_advantage else differences).double()
+    if collector.normalize_advantage and len(differences) > 1 and differences.std() > 0:
+        differences = (differences - differences.mean()) / (differences.std() + 1e-8)
+    expected[rollout.used] = differences.double()
     if collector.discount_scores and collector.reward_to_go:
         for steps, envs in steps_by_episode(rollout):
-            expected[steps, envs] *= collector.gamma ** th.arange(len(steps))
+            expected[steps, envs] *= collector.gamma ** th.arange(len(steps), dtype=th.float64)
     return relative_difference(training_weights(collector), expected)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_reinforce.common.tensors import map_parts, take
+from sb3_reinforce.common.tensors import take
 from sb3_reinforce.envs.checks import BadData, check_observation
 
 
@@ -75,6 +75,7 @@ class GymnasiumVecEnv(VecEnv):
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
             raise BadData(f"The rewards must be {self.num_envs} numbers, one per environment, got {rewards.tolist()}")
         check_batch(self.observation_space, obs, self.num_envs)
+        obs = copied(self.observation_space, obs)
         dones = terminated | truncated
         ended = np.flatnonzero(dones).tolist()
         if self.restart is None and ended and "final_obs" not in env_infos:
@@ -98,14 +99,15 @@ class GymnasiumVecEnv(VecEnv):
             for i in ended:
                 infos[i] |= info_of(episodes, i)
                 check_observation(self.observation_space, take(last_obs, i), i)
-                infos[i]["terminal_observation"] = map_parts(np.array, take(last_obs, i))
+                infos[i]["terminal_observation"] = copied(self.observation_space, take(last_obs, i))
             reset_infos = env_infos
             if self.restart is not None:
                 obs, reset_infos = self.restart(self.env, dones)
                 check_batch(self.observation_space, obs, self.num_envs)
+                obs = copied(self.observation_space, obs)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
-        return copied(self.observation_space, obs), rewards.astype(np.float32), dones, infos
+        return obs, rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
         """Close the vector environment."""

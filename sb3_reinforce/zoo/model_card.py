@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce.zoo.settings import ConfigurationError
 
-# Options of ``train`` that change the result, and their names in ``args.yml``; ``enjoy`` needs some, and the run
+# Options of ``train`` that change the result, and ``--exp-id`` of ``enjoy``, with their names in ``args.yml``
 OPTIONS = {
     "--algo": "algo",
     "--env": "env",
@@ -63,6 +63,8 @@ Mean reward of {n_episodes} deterministic episodes, after training with seed {se
 def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_id: int = 0) -> Path:
     """Evaluate a saved agent (run ``exp_id``, or the last if it is 0), and write ``README.md`` beside it."""
     env_name = utils.EnvironmentName(env_id)
+    # Later runs do not change what the card shows
+    exp_id = exp_id or utils.get_latest_run_id(str(Path(folder, name)), env_name)
     try:
         _, model, run = utils.get_model_path(exp_id, folder, name, env_name)
     except (AssertionError, ValueError) as error:
@@ -87,8 +89,6 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
         # The settings of the trial: others do not have its study
         arguments["hyperparams"] = settings
     path = Path(run, "README.md")
-    # The Zoo names a run ENV_NUMBER
-    number = path.parent.name.rpartition("_")[2]
     card = CARD.format(
         algorithm=type(agent).__name__,
         command=zoo_command("train", arguments),
@@ -98,7 +98,7 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
         seed=arguments["seed"],
         settings=yaml.dump(settings),
         std=std,
-        usage=zoo_command("enjoy", {each: arguments[each] for each in OF_ENJOY} | {"exp_id": number}),
+        usage=zoo_command("enjoy", {each: arguments[each] for each in OF_ENJOY} | {"exp_id": exp_id}),
     )
     path.write_text(card, encoding="utf-8")
     return path

@@ -152,7 +152,7 @@ def test_weights_are_not_checked_by_what_computes_them(monkeypatch):
     ("function", "replacement", "argument"),
     [
         ("timesteps_of", lambda *args: timesteps_of(*args) + 1, "discount_scores"),
-        ("standardize", lambda given: given, "normalize_advantage"),
+        ("standardize", lambda given: (given - given.mean()) / given.var(), "normalize_advantage"),
     ],
 )
 def test_discounts_and_normalization_are_checked_by_their_definitions(function, replacement, argument, monkeypatch):
