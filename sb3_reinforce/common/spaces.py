@@ -74,8 +74,7 @@ def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarr
 
 def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
     """Turn actions ``(..., *space.shape)`` counted from 0, as policies count, into actions of the space."""
-    start = getattr(space, "start", 0)
-    return actions + start if np.any(start) else actions
+    return actions + getattr(space, "start", 0)
 
 
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:
