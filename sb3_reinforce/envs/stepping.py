@@ -2,7 +2,8 @@
 A ``DummyVecEnv`` stepped with a check of each observation and reward where it is written.
 
 Only infos that can change are copied deeply. With 64 CartPoles the deep copies of ``DummyVecEnv.step_wait`` take a
-fourth of its time.
+fourth of its time. An array of the type and shape of the space is written without a further check or call, which took
+5 % of ``learn`` with 8 CartPoles.
 """
 
 from copy import deepcopy
@@ -10,6 +11,7 @@ from types import NoneType
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
@@ -24,6 +26,9 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
     rewards = env.buf_rews
     dones = env.buf_dones
     infos = []
+    is_box = type(env.observation_space) is spaces.Box
+    rows = env.buf_obs[None] if is_box else np.empty(0)  # type: ignore[index]
+    form = (rows.dtype, rows.shape[1:])
     dones[:] = False
     for i, (single, action) in enumerate(zip(env.envs, env.actions, strict=True)):
         obs, reward, terminated, truncated, info = single.step(action)
@@ -38,7 +43,10 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
             obs, env.reset_infos[i] = single.reset()
-        write_observation(env, i, obs)
+        if is_box and type(obs) is np.ndarray and (obs.dtype, obs.shape) == form:
+            rows[i] = obs
+        else:
+            write_observation(env, i, obs)
         infos.append(info)
     env.buf_infos = infos
     return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
