@@ -204,7 +204,7 @@ def weight_error(collector: REINFORCE, rollout: Rollout) -> float:
     values = baseline.values if isinstance(baseline, Recorded) else BASELINES[cast(str, baseline)](rollout)
     differences = without_rounding(rollout.returns - values.cpu(), rollout.returns).float()[rollout.used]
     expected = th.zeros_like(rollout.returns)
-    if collector.normalize_advantage and len(differences) > 1 and differences.std() > 0:
+    if collector.normalize_advantage and differences.max() > differences.min():
         differences = (differences - differences.mean()) / (differences.std() + 1e-8)
     expected[rollout.used] = differences.double()
     if collector.discount_scores and collector.reward_to_go:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch as th
-from environments import Tree
+from environments import Corridor, Tree
 from gradient_checks import ACTION_SPACES, HalfDetached, corridor, with_noise
 from gymnasium import spaces
 from models import FromDistribution
@@ -159,6 +159,13 @@ def test_discounts_and_normalization_are_checked_by_their_definitions(function, 
     assert failures(**{argument: True}) == []
     monkeypatch.setattr(weights, function, replacement)
     assert failures(**{argument: True}) == ["weights"]
+
+
+def test_equal_weights_are_not_normalized():
+    """Their standard deviation may be a rounding error above 0."""
+    env = Corridor((1,), lambda t, action: 0.1)
+    model = REINFORCE("MlpPolicy", env, baseline="none", normalize_advantage=True, device="cpu", seed=0)
+    assert "weights" not in check_gradient(model, n_episodes=7).failures
 
 
 def test_negation_is_seen_in_every_action_space():
