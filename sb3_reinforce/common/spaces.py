@@ -69,12 +69,14 @@ def env_actions_of(policy: ActorCriticPolicy) -> Callable[[np.ndarray], np.ndarr
     space = policy.action_space
     if isinstance(space, spaces.Box):
         return policy.unscale_action if policy.squash_output else lambda actions: actions.clip(space.low, space.high)
-    return partial(shift_to_start, space)
+    # Asked once: np.any takes longer than the forward pass of a small network
+    return partial(shift_to_start, space) if np.any(getattr(space, "start", 0)) else lambda actions: actions
 
 
 def shift_to_start(space: spaces.Space[Any], actions: np.ndarray) -> np.ndarray:
     """Turn actions ``(..., *space.shape)`` counted from 0, as policies count, into actions of the space."""
-    return actions + getattr(space, "start", 0)
+    start = getattr(space, "start", 0)
+    return actions + start if np.any(start) else actions
 
 
 def as_policy_actions(actions: th.Tensor, action_space: spaces.Space[Any]) -> th.Tensor:

@@ -108,8 +108,8 @@ def functions_of(baselines: Any) -> dict[str, Baseline]:
         name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
         if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(
-                f"baselines must have names that differ from each other and from 'floor', got {name!r} again: set the "
-                "__name__ of your function"
+                f"baselines must have names that differ from each other and from 'floor', and {name!r} is taken: set "
+                "the __name__ of your function"
             )
         functions[name] = function
     return functions

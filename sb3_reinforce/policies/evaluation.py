@@ -215,7 +215,8 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
             return
         hook = DivideLogits(th.ones((), dtype=th.float32, device=policy.device))
         layer.register_forward_hook(hook)
-    hook.temperature.fill_(max(temperature, MIN_TEMPERATURE))
+    # The policy may have been moved since
+    hook.temperature = hook.temperature.to(policy.device).fill_(max(temperature, MIN_TEMPERATURE))
 
 
 @th.no_grad()

@@ -168,7 +168,7 @@ class MaskedLogits(nn.Module):
 
     def forward(self, latent: th.Tensor) -> th.Tensor:
         latent, mask = split_mask(latent, sum(self.sizes))
-        # Where nothing is allowed, as in terminal states, all is: with all logits FORBIDDEN, log π would round to 0
+        # A mask that allows nothing, as in terminal states, allows all: with all logits FORBIDDEN, log π would be 0
         allowed = [part | ~part.any(-1, keepdim=True) for part in th.split(mask.bool(), self.sizes, dim=-1)]
         logits: th.Tensor = self.action_net(latent)
         return logits.masked_fill(~th.cat(allowed, dim=-1), FORBIDDEN)

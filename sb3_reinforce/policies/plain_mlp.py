@@ -141,7 +141,7 @@ def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
 def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
     """The outputs over τ, if the last layer has a temperature."""
     hook = temperature_hook(head)
-    return outputs if hook is None else outputs / hook.temperature
+    return outputs if hook is None else hook(head, (), outputs)
 
 
 def numpy_layers(
@@ -181,7 +181,7 @@ def numpy_forward(layers: list[nn.Module], n: int) -> Callable[[np.ndarray], Flo
         x: Float32s = obs.reshape(n, -1).astype(np.float32, copy=False)
         for operation in operations:
             x = operation(x)
-        return x if hook is None else x / np.float32(hook.temperature)
+        return x if hook is None else x / np.float32(float(hook.temperature))
 
     return outputs
 

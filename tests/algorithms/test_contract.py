@@ -70,6 +70,9 @@ def test_spaces(kind, observation_space, action_space, policy):
     assert kind == "search" or isinstance(action_space, spaces.Box) or model.rollout_buffer.actions.min() == 0
     actions, _ = model.predict(env.reset())
     assert len(actions) == 2 and all(action_space.contains(action) for action in actions)
+    # As in A2C, an array also for one observation
+    action, _ = model.predict(observation_space.sample())
+    assert isinstance(action, np.ndarray) or np.any(getattr(action_space, "start", 0))
 
 
 @pytest.mark.parametrize("squash_output", [False, True])
