@@ -176,3 +176,10 @@ def test_two_processes_learn_on_any_devices(devices, tmp_path):
         before = make(kind, "cpu").policy.state_dict()
         assert any(not th.equal(first[name], before[name]) for name in first)
         assert all(th.equal(first[name], second[name]) for name in first)
+
+
+def test_a_policy_with_a_temperature_can_be_moved_to_the_cpu():
+    model = REINFORCE("MlpPolicy", "CartPole-v1", temperature=0.5, device="cuda", seed=0)
+    model.policy.to("cpu")
+    actions, _ = model.predict(np.zeros((3, 4), np.float32))
+    assert actions.shape == (3,)
