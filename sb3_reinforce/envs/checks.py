@@ -43,6 +43,16 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
     )
 
 
+def check_length(n_steps: int, max_episode_steps: float, alternative: str = "") -> None:
+    """Refuse to step an episode that has lasted ``n_steps`` and may not be longer."""
+    if n_steps == max_episode_steps:
+        raise ValueError(
+            f"An episode has not ended after max_episode_steps={max_episode_steps} steps: give the environment a time "
+            f"limit, or raise max_episode_steps{alternative}. If an EvalCallback uses the same environments, give it "
+            "separate ones. The parameters have not changed."
+        )
+
+
 def as_reward(reward: Any, env: int) -> float:
     """Convert the reward of an environment, which must be one number, to a float."""
     values = np.asarray(reward.detach().cpu() if isinstance(reward, th.Tensor) else reward)

@@ -18,7 +18,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.tensors import stack, take
-from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.envs.checks import check_finite, check_length
 from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
 from sb3_reinforce.sampling.normalization import original_reward_of
@@ -48,20 +48,16 @@ class EpisodeTracker:
         self.clock = 0
         self.started_at = np.zeros(n_envs, dtype=int)
         self.max_episode_steps = max_episode_steps
-        self.deadline = max_episode_steps
+        # The first step of the longest episode that runs
+        self.first_step = 0
 
     def add(self, rewards: np.ndarray, obs: Any) -> None:
         """Add a step, after checking that its numbers are finite and that no episode is longer than allowed."""
+        check_length(self.clock - self.first_step, self.max_episode_steps)
         check_finite("The reward", rewards, (None,))
         check_finite("The observation", obs, (None,))
         self.totals += rewards
         self.clock += 1
-        if self.clock > self.deadline:
-            raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps: give the "
-                "environment a time limit, or raise max_episode_steps. If an EvalCallback uses the same environments, "
-                "give it separate ones. The parameters have not changed."
-            )
 
     def finish(self, finished: np.ndarray, returns: np.ndarray) -> list[int]:
         """Write the finished episodes to ``returns[candidate, episode]``, and list the environments with new pairs."""
@@ -76,7 +72,7 @@ class EpisodeTracker:
             else:
                 # Its last candidate keeps acting: these steps are only counted
                 self.active[env] = False
-        self.deadline = self.max_episode_steps + int(self.started_at.min())
+        self.first_step = int(self.started_at.min())
         return restarted
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.common.tensors import map_parts
-from sb3_reinforce.envs.checks import check_finite
+from sb3_reinforce.envs.checks import check_finite, check_length
 from sb3_reinforce.estimation.returns import Bools
 from sb3_reinforce.policies.evaluation import calls
 from sb3_reinforce.sampling.actors import Actor, NumpyActor
@@ -40,7 +40,8 @@ class Extent:
         self.max_episode_steps = max_episode_steps
         self.remaining = quota.copy()
         self.starts = np.zeros_like(quota)
-        self.deadline = max_episode_steps
+        # The first step of the longest episode that is waited for
+        self.first_step = 0
         self.is_complete = False
 
     @classmethod
@@ -55,22 +56,13 @@ class Extent:
         quota = n_episodes // n_envs + (np.arange(n_envs) < n_episodes % n_envs)
         return cls(quota, max_episode_steps=max_episode_steps)
 
-    def check_length(self, n_steps: int) -> None:
-        """Refuse an episode that never ends."""
-        if n_steps == self.deadline:
-            raise ValueError(
-                f"An episode has not ended after max_episode_steps={self.max_episode_steps} steps, and the rollout "
-                "waits for whole episodes: give the environment a time limit, raise max_episode_steps, or train with "
-                "n_steps instead of n_episodes. If an EvalCallback uses the same environments, give it separate ones"
-            )
-
     def count(self, dones: Bools, n_steps: int) -> list[int]:
         """Count the episodes that ended with this step; return the environments whose episode is in the quota."""
         counted = np.flatnonzero(dones & (self.remaining > 0))
         self.remaining[counted] -= 1
         self.starts[counted] = n_steps
         self.is_complete = not self.remaining.any()
-        self.deadline = self.max_episode_steps + self.starts[self.remaining > 0].min(initial=n_steps)
+        self.first_step = int(self.starts[self.remaining > 0].min(initial=n_steps))
         return list(counted.tolist())
 
 
@@ -102,7 +94,9 @@ def collect(
     n_steps = 0
     first_row = 0
     while n_steps < extent.n_steps and not extent.is_complete:
-        extent.check_length(n_steps)
+        check_length(
+            n_steps - extent.first_step, extent.max_episode_steps, ", or train with n_steps instead of n_episodes"
+        )
         if n_steps == rollout_buffer.buffer_size:
             resize(rollout_buffer, 2 * n_steps)
         if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
