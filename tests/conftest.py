@@ -25,6 +25,8 @@ def same_random_numbers(monkeypatch):
 @pytest.fixture(autouse=True)
 def as_in_a_terminal():
     """A shell that runs the tests in the background lets them ignore SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sigint = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sigterm = signal.getsignal(signal.SIGTERM)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, sigint)
+    signal.signal(signal.SIGTERM, sigterm)

@@ -1,4 +1,4 @@
-"""Several processes that are one group of PyTorch's, as torchrun makes them, but forked, which takes no second."""
+"""Several processes that are one group of PyTorch's, as torchrun makes them, but forked: torchrun takes seconds."""
 
 import multiprocessing
 import os

@@ -190,16 +190,13 @@ def test_a_vec_env_may_reuse_its_arrays(kind):
     assert all(map(th.equal, *outcomes))
 
 
-class OwnAdd(RolloutBuffer):
-    def add(self, *args, **kwargs):
-        return super().add(*args, **kwargs)
-
-
 def test_rollout_buffer_classes():
     model = make("steps", rollout_buffer_class=RolloutBuffer, rollout_buffer_kwargs={})
     assert type(model.rollout_buffer) is RolloutBuffer
-    with pytest.warns(UserWarning, match=r"OwnAdd overrides add"):
-        make("steps", rollout_buffer_class=OwnAdd)
+    for name in ("add", "get", "compute_returns_and_advantage"):
+        own = type("Own", (RolloutBuffer,), {name: lambda self, *args, **kwargs: None})
+        with pytest.warns(UserWarning, match=f"Own overrides {name},"):
+            make("steps", rollout_buffer_class=own)
     with pytest.raises(TypeError, match="wrong_keyword"):
         make("steps", rollout_buffer_kwargs={"wrong_keyword": 1})
 

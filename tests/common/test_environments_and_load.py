@@ -191,8 +191,10 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
 
 @both
 def test_load_replaces_other_attributes_as_stable_baselines3_does(kind, tmp_path):
-    make(kind, Corridor()).learn(8).save(tmp_path / "model")
-    assert KINDS[kind][0].load(tmp_path / "model", device="cpu", num_timesteps=0).num_timesteps == 0
+    make(kind, Corridor()).learn(8).save(tmp_path / "model", include=["is_collecting"])
+    of_sb3 = {"force_reset": False, "print_system_info": False, "num_timesteps": 0}
+    model = KINDS[kind][0].load(tmp_path / "model", device="cpu", is_collecting=True, **of_sb3)
+    assert model.num_timesteps == 0 and model.is_collecting
 
 
 def test_what_the_user_has_set_later_is_kept_at_load(tmp_path):

@@ -67,11 +67,20 @@ def test_a_gradient_that_is_not_finite_is_refused(kind):
     extra = {"standardize_utilities": False} if kind == "search" else {"normalize_advantage": False}
     model = make(kind, Corridor((7,), reward=lambda t, action: 3e38 * (1 - 2 * (action == 0))), **extra)
     before = plain(model.policy.state_dict())
-    with np.errstate(over="ignore"), pytest.raises(ValueError, match="not finite"):
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match=r"gradient of the (policy|utility) is not finite"):
         model.learn(1)
     assert plain(model.policy.state_dict()) == before and model._n_updates == 0
     model.set_env(Corridor((7,)))
     model.learn(64, reset_num_timesteps=False)
+
+
+def test_the_gradient_of_a_critic_that_is_not_finite_is_named():
+    model = make("steps")
+    model.policy.value_net.weight.register_hook(lambda gradient: gradient * NAN)
+    before = plain(model.policy.value_net.state_dict())
+    with pytest.raises(ValueError, match="The gradient of the critic is not finite"):
+        model.learn(8)
+    assert plain(model.policy.value_net.state_dict()) == before
 
 
 class Unreached(Corridor):

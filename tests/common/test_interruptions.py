@@ -16,14 +16,6 @@ from sb3_reinforce import REINFORCE, reinforce
 from sb3_reinforce.common.interruptions import interruptible, uninterrupted
 
 
-@pytest.fixture(autouse=True)
-def sigterm():
-    """The handler of SIGTERM, which is restored after each test."""
-    handler = signal.getsignal(signal.SIGTERM)
-    yield handler
-    signal.signal(signal.SIGTERM, handler)
-
-
 def fail(model):
     raise RuntimeError("callback")
 
@@ -47,14 +39,14 @@ UNWRAPPED = [(stop, lambda env: env) for stop in ("reward", "observation")]
 
 @all_kinds
 @pytest.mark.parametrize(("stop", "wrapper"), [*((stop, VecNormalize) for stop in STOPS), *UNWRAPPED])
-def test_a_stopped_model_is_the_last_good_one_and_can_be_saved_and_trained_on(stop, wrapper, kind, tmp_path, sigterm):
+def test_a_stopped_model_is_the_last_good_one_and_can_be_saved_and_trained_on(stop, wrapper, kind, tmp_path):
     act, fault, error = STOPS[stop]
     model = make(kind, wrapper(DummyVecEnv([lambda: Faulty(at=52, **fault)])), learning_rate=lambda left: 1e-3 * left)
     policies = Record(lambda model: plain(model.policy.state_dict()), at="step")
-    sigint = signal.getsignal(signal.SIGINT)
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pytest.raises(error) if error else nullcontext():
         model.learn(100, [policies, At(40, act)] if act else policies)
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == (sigint, sigterm)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
     assert model.num_timesteps == 40 or fault
     assert model._n_updates > 0 and plain(model.policy.state_dict()) == policies.records[-1]
     assert_counters_agree(model)

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from environments import Corridor
+from gymnasium import spaces
 from models import KINDS, Scaled, make, plain
 from processes import ActAsRecorded, RecordRollouts, Replay, in_processes, logged
 from stable_baselines3.common.env_util import make_vec_env
@@ -178,14 +179,25 @@ def test_moments_seen_since_are_exact_far_from_zero():
     assert np.allclose(seen.var, data[4000:].var(0), rtol=1e-6)
 
 
-DIFFERENT = {"gamma": "gamma=0.9", "n_envs": "n_envs=1", "policy": "Tanh", "VecNormalize": "VecNormalize=[]"}
+DIFFERENT = {
+    "gamma": "gamma=0.9",
+    "normalize_by": "normalize_by='steps'",
+    "n_envs": "n_envs=1",
+    "spaces": "Box(-1.0",
+    "policy": "Tanh",
+    "VecNormalize": "VecNormalize=[]",
+}
 
 
 def differ(rank, name):
-    kwargs = {"gamma": 0.9 + 0.05 * rank} if name == "gamma" else {}
-    if name == "policy":
-        kwargs = {"policy_kwargs": {"activation_fn": [th.nn.Tanh, th.nn.ReLU][rank]}}
+    kwargs = {
+        "gamma": {"gamma": 0.9 + 0.05 * rank},
+        "normalize_by": {"normalize_by": ["steps", "episodes"][rank]},
+        "policy": {"policy_kwargs": {"activation_fn": [th.nn.Tanh, th.nn.ReLU][rank]}},
+    }.get(name, {})
     env = corridors(1 + rank if name == "n_envs" else 1)
+    if name == "spaces":
+        env = make_vec_env(lambda: Corridor(action_space=spaces.Box(-1, 1 + rank, (1,))), 1)
     model = make("steps", VecNormalize(env) if name == "VecNormalize" and rank else env, **kwargs)
     model.learn(10)
 

@@ -7,10 +7,13 @@ import pytest
 import torch as th
 from environments import Corridor
 from models import KINDS, both, make, plain
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 NAN = float("nan")
 
@@ -176,6 +179,19 @@ def test_parameters_of_other_algorithms(kind, other, same_optimizer, tmp_path):
         model.learn(32)
     trained.set_parameters({"policy": model.get_parameters()["policy"]}, exact_match=False)
     assert plain(trained.policy.state_dict()) == plain(model.policy.state_dict())
+
+
+def test_parameters_of_recurrent_ppo(tmp_path):
+    arguments = {"policy_kwargs": {"lstm_hidden_size": 4}, "device": "cpu"}
+    trained = RecurrentPPO("MlpLstmPolicy", Corridor(), n_steps=16, batch_size=16, **arguments).learn(16)
+    trained.save(tmp_path / "other")
+    for states in (trained.get_parameters(), tmp_path / "other"):
+        model = RecurrentREINFORCE("MlpLstmPolicy", Corridor(), **arguments)
+        model.set_parameters(states, exact_match=False)
+        assert plain(model.policy.state_dict()) == plain(trained.policy.state_dict())
+        moments = (each.policy.optimizer.state_dict()["state"] for each in (model, trained))
+        assert len({str(plain(each)) for each in moments}) == 1
+        model.learn(32)
 
 
 class Masked(ActorCriticPolicy):

@@ -21,6 +21,7 @@ from sb3_reinforce.diagnostics import compare_baselines, compare_estimators, est
 from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
 from sb3_reinforce.diagnostics.tables import Estimate, Table
+from sb3_reinforce.estimation.perturbations import default_delta_std
 
 
 def bandit(algorithm=REINFORCE, n_envs=8, **kwargs):
@@ -88,12 +89,30 @@ def test_the_steps_of_each_estimator_are_those_of_its_episodes():
     assert {row.estimator: row.steps for row in table} == expected
 
 
+def test_the_default_scale_of_perturbations_is_the_rule_of_thumb(monkeypatch):
+    model = bandit()
+    first_theta = []
+    evaluated = []
+    evaluate = CandidateUtility.__call__
+
+    def record(utility, thetas):
+        first_theta.append(utility.theta)
+        evaluated.append(thetas - utility.theta)
+        return evaluate(utility, thetas)
+
+    monkeypatch.setattr(CandidateUtility, "__call__", record)
+    ones = lambda k, n, generator: th.ones(k, n)  # noqa: E731
+    compare_estimators(model, 4, 3, ["central"], ones, n_delta=2, delta_std=None, n_resamples=2)
+    first = evaluated[0].flatten(0, -2)[0]
+    th.testing.assert_close(first, th.full_like(first, default_delta_std(first_theta[0])))
+
+
 @pytest.mark.parametrize("algorithm", [REINFORCE, pytest.param(FiniteDifference, marks=pytest.mark.slow)])
 def test_all_estimators_see_the_same_gradient(algorithm):
     model = bandit(algorithm)
     table = compare_estimators(model, 200, 60, perturbation="sphere", n_delta=16, delta_std=1.0)
     assert table.names == ["likelihood_ratio", "forward", "central", "regression"]
-    assert all(row.cosine.high > 0.95 for row in table)
+    assert all(row.cosine.low > 0.8 for row in table)
     assert table["likelihood_ratio"].cosine.low > 0.9
     assert table["likelihood_ratio"].snr_per_step.low > 0
     assert set(table.legend) == {*table.columns[1:], "[a, b]"}
@@ -219,7 +238,7 @@ def save(ax, path):
     assert path.stat().st_size > 1000
 
 
-def test_every_picture_can_be_saved(tmp_path):
+def test_every_picture_can_be_saved(tmp_path, capsys):
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 20, reference="mean")
     ax = plots.plot_baselines(table)
     assert [label.get_text() for label in ax.get_yticklabels()] == table.names[:-1]
@@ -230,16 +249,23 @@ def test_every_picture_can_be_saved(tmp_path):
         assert drawn[y].get_xdata() == [row.ratio.value]
         assert ax.collections[y].get_segments()[0].tolist() == [[row.ratio.low, y], [row.ratio.high, y]]
         assert (drawn[y].get_markerfacecolor() == "white") == (row.bias != 0)
+    floors = [line.get_xdata() for line in ax.get_lines() if len(line.get_xdata()) == 2]
+    assert floors == [[table["floor"].ratio.value] * 2]
     save(ax, tmp_path / "baselines.png")
     scores = np.random.rand(5, 8)
-    ax = plots.plot_learning_curves({"a": scores, "b": np.random.rand(4, 3, 8)}, np.arange(8))
+    ax = plots.plot_learning_curves({"a": scores, "b": np.random.rand(4, 3, 8)}, np.arange(8), confidence=0.5)
     assert [line.get_label() for line in ax.get_lines()] == ["a (5 runs)", "b (4 runs)"]
     np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), np.sort(scores, axis=0)[1:4].mean(0))
+    vertices = ax.collections[0].get_paths()[0].vertices
+    _, low, high = plots.interquartile_interval(scores[:, None], 500, 0.5, 0)
+    assert {*vertices[vertices[:, 0] == 3, 1]} == {low[3], high[3]}
     save(ax, tmp_path / "curves.png")
     fans = {"one": th.ones(4), "three": th.randn(3, 4)}
     found = landscape(bandit(), fans, n_points=3, n_episodes=2, progress_bar=True)
     assert [steps.shape for steps in found.steps.values()] == [(2,), (3, 2)]
+    assert "| 18/18 [" in capsys.readouterr().err
     ax = plots.plot_landscape(found)
+    assert ax.images[0].origin == "lower" and np.array_equal(ax.images[0].get_array(), found.utilities)
     assert "3 × 3 points of 2 episodes" in ax.get_title() and ax.get_xlim() == (-1.5, 1.5)
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["one (1)", "three (3)"]
     for arrows, steps in zip(ax.collections, found.steps.values(), strict=True):

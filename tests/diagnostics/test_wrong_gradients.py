@@ -84,7 +84,7 @@ def test_policies_with_other_heads_and_samples(policy, failures):
 
 
 class WrongReturns(REINFORCE):
-    """Forgets the discount factor of what is still to come."""
+    """Counts the reward of each step twice."""
 
     def collect_rollouts(self, *args, **kwargs):
         going_on = super().collect_rollouts(*args, **kwargs)
@@ -188,8 +188,8 @@ def test_a_wrong_sign_is_seen_with_little_and_with_much_noise(log_std_init, poli
     assert check_gradient(with_noise(log_std_init, policy, n_actions=2))["sign"].error == 1
 
 
-class Greedy(ActorCriticPolicy):
-    """Takes a uniform action in 30 % of the states, and reports log π of the network."""
+class PartlyUniform(ActorCriticPolicy):
+    """Takes a uniform action with a chance of 30 %, and reports log π of the network."""
 
     def forward(self, obs, deterministic=False):
         actions, values, _ = super().forward(obs, deterministic)
@@ -216,7 +216,7 @@ class Warm(ActorCriticPolicy):
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
-    for policy, is_right in ((Greedy, False), ("MlpPolicy", True)):
+    for policy, is_right in ((PartlyUniform, False), ("MlpPolicy", True)):
         model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=seed)
         with th.no_grad():
             model.policy.action_net.bias[0] = 2.0

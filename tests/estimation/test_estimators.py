@@ -164,7 +164,7 @@ def test_perturbations_that_are_no_tensor_are_named(name):
         ESTIMATORS[name](lambda x: pytest.fail("evaluated"), th.zeros(N).double(), np.eye(N))
 
 
-def test_fit_quality_is_a_textbook_regressions():
+def test_fit_quality_agrees_with_the_textbook():
     m = 400
     slope, deltas, noise = normal(1, N, seed=0)[0], normal(m, N, seed=1), normal(m, 1, seed=2)[:, 0]
     utilities = 3 + deltas @ slope + 0.5 * noise

@@ -284,7 +284,7 @@ def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
     assert 0.01 / 2**8 <= kl <= 0.012
 
 
-class Scaled(ActorCriticPolicy):
+class OtherFeatures(ActorCriticPolicy):
     """Learns from other features than ``get_distribution`` sees."""
 
     def extract_features(self, obs, features_extractor=None):
@@ -297,7 +297,7 @@ class Scaled(ActorCriticPolicy):
 @pytest.mark.parametrize(
     ("policy", "extractor", "sentence"),
     [
-        (Scaled, FlattenExtractor, "get_distribution of Scaled does not give the log π"),
+        (OtherFeatures, FlattenExtractor, "get_distribution of OtherFeatures does not give the log π"),
         ("MlpPolicy", Dropping, "does not give the log π that it learns from .dropout"),
         ("MlpPolicy", Normalized, "does not give the log π that it learns from .dropout, batch normalization"),
     ],

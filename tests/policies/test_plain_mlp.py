@@ -1,4 +1,4 @@
-"""The fast passes of plain MLPs compute what the modules compute, with the same gradients."""
+"""The fast passes of plain MLPs compute what the modules compute."""
 
 import copy
 from itertools import product

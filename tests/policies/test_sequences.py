@@ -69,7 +69,7 @@ def test_sequences_are_steps(name, network, carried, limit, monkeypatch):
 
 
 @pytest.mark.parametrize("network", NETWORKS[:4], ids=str)
-def test_the_critic_s_state_after_a_rollout(network):
+def test_the_critics_state_after_a_rollout(network):
     policy, obs, state, rows = policy_and_rows("MlpLstmPolicy", network, carried=True)
     last = take(rows, rows["sequence"] == episode_numbers(th.as_tensor(DONES))[-1].repeat(len(DONES)))
     after = policy.state_after(last)

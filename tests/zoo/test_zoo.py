@@ -1,4 +1,4 @@
-"""The RL Zoo's commands end to end, for both algorithms and one of the Zoo's own, and what they say of errors."""
+"""The RL Zoo's commands end to end, for all three algorithms and one of the Zoo's own, and what they say of errors."""
 
 import importlib
 import re
@@ -18,6 +18,9 @@ import torch as th
 import yaml
 from matplotlib import pyplot
 from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecNormalize
 from zoo_commands import NAMES, RUN, config_of, message_of, train, zoo
 
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
@@ -49,7 +52,9 @@ def test_enjoy(name, folder, capsys):
     others = {"reinforce": ["--load-best", "--load-last-checkpoint"], "finite_difference": ["--load-best"]}
     for which in ((), *((option,) for option in others.get(name, ()))):
         zoo("enjoy", "--algo", name, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "600", *which)
-        assert "Mean reward: " in capsys.readouterr().out
+        out = capsys.readouterr().out
+        assert "Mean reward: " in out
+        assert ("Loading running average" in out) == ("normalize" in config_of(folder / "logs" / name / RUN))
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -63,6 +68,12 @@ def test_a_model_card_describes_the_last_agent(name, folder):
     assert f"enjoy --algo {name} --env CartPole-v1 -f logs --exp-id 2\n" in text and "-n 400 -f logs --seed 1" in text
     settings = text.partition("```yaml\n")[2].partition("```")[0]
     assert yaml.safe_load(settings) == config_of(card.parent)
+    env = make_vec_env("CartPole-v1", 10, seed=1001)
+    if "normalize" in config_of(card.parent):
+        env = VecNormalize.load(str(card.parent / "CartPole-v1" / "vecnormalize.pkl"), env)
+        env.training = env.norm_reward = False
+    agent = ALGORITHMS[name].load(card.parent / "CartPole-v1.zip", device="cpu")
+    assert "**{:.2f} ± {:.2f}**".format(*evaluate_policy(agent, env, 2)) in text
 
 
 def test_a_model_card_of_an_environment_in_a_namespace(tmp_path, monkeypatch):
@@ -124,13 +135,6 @@ def test_record_video_also_of_an_environment_of_another_package(name, tmp_path, 
     assert all(re.search(f"zoo {command} .*--gym-packages own_envs", card) for command in ("train", "enjoy"))
     gym.registry.pop("Own-v0")
     assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
-
-
-def test_statistics_of_normalization_come_back(tmp_path, capsys):
-    common = ("--algo", "finite_difference", "--env", "Pendulum-v1", "-f", str(tmp_path))
-    zoo("train", *common, "-n", "200", "--eval-freq", "-1")
-    zoo("enjoy", *common, "--no-render", "-n", "200")
-    assert "Loading running average" in capsys.readouterr().out
 
 
 @pytest.mark.slow

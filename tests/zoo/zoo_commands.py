@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import gymnasium as gym
 import matplotlib
 import pytest
 import yaml
@@ -14,6 +15,13 @@ from sb3_reinforce.zoo.__main__ import main
 
 NAMES = [*ALGORITHMS, "a2c"]
 RUN = "CartPole-v1_1"
+
+
+class AtariEnv(gym.Env[Any, Any]):
+    """The Zoo takes an environment with this name in its entry point for a game of Atari."""
+
+
+GAME = gym.envs.registration.EnvSpec("Game-v0", AtariEnv)
 
 
 def zoo(*arguments: str) -> None:
