@@ -352,7 +352,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
                 self.rollout = self._complete(
                     rollout_buffer, columns, has_values, baseline, n_rollout_steps is not None
                 )
-                self._running = self._running.after(rollout_buffer.rewards, columns.dones, self.gamma)
             is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
@@ -410,10 +409,15 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             normalize_by=self.normalize_by,
             episodes_per_start=self.episodes_per_start,
         )
+        self._running = self._running.after(buffer.rewards, columns.dones, self.gamma)
         return rollout
 
     def collect_part(self, callback: BaseCallback) -> None:
         self.collect_rollouts(cast(VecEnv, self.env), callback, self.rollout_buffer, self.n_steps)
+
+    def adopt(self, state: dict[str, Any]) -> None:
+        super().adopt(state)
+        self._apply_temperature_and_floor()
 
     def _make_actor(self, calls_forward: bool, with_log_prob: bool) -> Actor:
         return make_actor(self.policy, calls_forward, self.n_envs, with_log_prob)

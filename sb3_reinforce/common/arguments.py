@@ -108,8 +108,8 @@ class CheckedSchedule(FloatSchedule):
         check_kind(name, schedule, (Real, Callable), "a number or a schedule")
         super().__init__(schedule if callable(schedule) else check_number(name, schedule, 0, high, above))
         self.given = schedule
-        self.check = partial(check_number, low=0, high=high)
         self.name = name
+        self.high = high
         self.above = above
         self.may_reach_zero = may_reach_zero
         for progress_remaining in (1.0, 0.0):
@@ -124,7 +124,7 @@ class CheckedSchedule(FloatSchedule):
         # At the end of training nothing is drawn any more
         is_excluded = progress_remaining == 1 if self.may_reach_zero else progress_remaining > 0
         where = f"{self.name} (at progress_remaining={progress_remaining:g})"
-        return self.check(where, value, above=self.above and is_excluded)
+        return check_number(where, value, 0, self.high, self.above and is_excluded)
 
 
 def optional(check: Check) -> Check:

@@ -86,8 +86,8 @@ class Distributed(BaseAlgorithm):
 
     def shared_state(self) -> dict[str, Any]:
         """What the other processes need to collect as process 0 does."""
-        attributes = {name: value for name, value in vars(self).items() if isinstance(value, SHARED)}
-        del attributes["verbose"]
+        shared = {name for name, value in vars(self).items() if isinstance(value, SHARED)} - MAY_DIFFER
+        attributes = {name: getattr(self, name) for name in shared}
         policy = {name: values.cpu() for name, values in self.policy.state_dict().items()}
         # A search draws candidates of the trainable parameters
         trainable = [parameter.requires_grad for parameter in self.policy.parameters()]

@@ -41,17 +41,13 @@ uninterrupted = Uninterrupted()
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Raise ``KeyboardInterrupt`` on SIGTERM too, unless the user handles it; neither it nor Ctrl-C cuts an update."""
-    replaced: dict[int, Any] = {}
     in_main_thread = threading.current_thread() is threading.main_thread()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before = signal.getsignal(number)
-        is_default_end = number == signal.SIGTERM and before is signal.SIG_DFL
-        handler = signal.default_int_handler if is_default_end else before
-        if in_main_thread and callable(handler):
-            replaced[number] = before
-            signal.signal(number, partial(uninterrupted.handle_signal, handler))
-    try:
+    with ExitStack() as replaced:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before = signal.getsignal(number)
+            is_default_end = number == signal.SIGTERM and before is signal.SIG_DFL
+            handler = signal.default_int_handler if is_default_end else before
+            if in_main_thread and callable(handler):
+                replaced.callback(signal.signal, number, before)
+                signal.signal(number, partial(uninterrupted.handle_signal, handler))
         yield
-    finally:
-        for changed, before in replaced.items():
-            signal.signal(changed, before)

@@ -18,9 +18,8 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 
 def check_env(env: Any, verbose: int, n_envs: int | None = None) -> GymEnv:
     """Make the environment if it is an id, and check its spaces and its number of copies."""
-    vectorized = isinstance(env, gym.vector.VectorEnv)
-    if vectorized or not isinstance(env, (str, gym.Env, VecEnv)):
-        hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if vectorized else ""
+    if not isinstance(env, (str, gym.Env, VecEnv)):
+        hint = ": wrap it in sb3_reinforce.GymnasiumVecEnv" if isinstance(env, gym.vector.VectorEnv) else ""
         if any(each.__module__.split(".")[0] == "gym" for each in type(env).__mro__):
             hint = ": wrap it in DummyVecEnv([lambda: env]), which converts environments of OpenAI Gym"
         raise TypeError(f"env must be a gymnasium.Env, a VecEnv or a registered id, got {env!r}{hint}")

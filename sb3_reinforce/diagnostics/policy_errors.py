@@ -92,11 +92,8 @@ def size_of_outputs(layer: th.nn.Linear, evaluate: Callable[[], object]) -> floa
     def measure(_: th.nn.Module, inputs: tuple[th.Tensor, ...]) -> None:
         sizes.append(th.nn.functional.linear(inputs[0], layer.weight).square().mean().sqrt().item())
 
-    handle = layer.register_forward_pre_hook(measure)
-    try:
+    with layer.register_forward_pre_hook(measure):
         evaluate()
-    finally:
-        handle.remove()
     return sizes[-1]
 
 

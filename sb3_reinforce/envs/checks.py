@@ -90,3 +90,24 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
         )
     if not isinstance(space, spaces.Box) and not space.contains(values.astype(space.dtype)):
         raise BadData(f"The observation of environment {env} must be in {space}, got {obs!r}")
+
+
+def checked_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> Any:
+    """A copy of observations ``(n_envs, ...)``, or of a dict of them, whose form is right; see ``copied``."""
+    if isinstance(space, spaces.Dict) and isinstance(obs, dict) and obs.keys() >= space.spaces.keys():
+        return {key: checked_batch(part, obs[key], n_envs) for key, part in space.spaces.items()}
+    rows = np.array(obs)
+    if rows.shape[:1] != (n_envs,):
+        raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
+    # Rows of one array share their form, but some floats are whole numbers and some are not
+    share_form = isinstance(space, spaces.Box) and (rows.dtype.kind != "f" or np.dtype(space.dtype).kind == "f")
+    for i in range(1 if share_form else n_envs):
+        check_observation(space, rows[i], i)
+    return rows
+
+
+def copied(space: spaces.Space[Any], obs: Any) -> Any:
+    """A copy without keys that the space lacks: environments may write the next observations into the same arrays."""
+    if isinstance(space, spaces.Dict):
+        return {key: copied(part, obs[key]) for key, part in space.spaces.items()}
+    return np.array(obs)

@@ -5,11 +5,11 @@ Some environments step all their copies in one array operation, far faster than 
 """
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_reinforce.common.interruptions import uninterrupted
 from sb3_reinforce.common.tensors import take
-from sb3_reinforce.envs.checks import BadData, check_observation
+from sb3_reinforce.envs.checks import BadData, check_observation, checked_batch, copied
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -46,6 +47,8 @@ class GymnasiumVecEnv(VecEnv):
         self.restart = find_restart(env)
         self.copies: Any = getattr(env.unwrapped, "envs", None)
         self.actions: Any = None
+        # A signal that cut a call would leave answers of other processes unread
+        self.finishes_calls: Any = uninterrupted if isinstance(env.unwrapped, AsyncVectorEnv) else nullcontext()
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
@@ -53,12 +56,12 @@ class GymnasiumVecEnv(VecEnv):
         first = self._options[0]
         if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")
-        obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
-        check_batch(self.observation_space, obs, self.num_envs)
+        with self.finishes_calls:
+            obs, infos = self.env.reset(seed=self._seeds[0], options=first or None)
+        observations: VecEnvObs = checked_batch(self.observation_space, obs, self.num_envs)
         self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        observations: VecEnvObs = copied(self.observation_space, obs)
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -67,15 +70,15 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Make the step; malformed observations and rewards are refused."""
-        obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
+        with self.finishes_calls:
+            obs, rewards, terminated, truncated, env_infos = self.env.step(self.actions)
         rewards = np.asarray(rewards)
         # Integers would not mask, but index the copies 0 and 1
         terminated = np.asarray(terminated, dtype=bool)
         truncated = np.asarray(truncated, dtype=bool)
         if rewards.shape != (self.num_envs,) or rewards.dtype.kind not in "biuf":
             raise BadData(f"The rewards must be {self.num_envs} numbers, one per environment, got {rewards.tolist()}")
-        check_batch(self.observation_space, obs, self.num_envs)
-        obs = copied(self.observation_space, obs)
+        obs = checked_batch(self.observation_space, obs, self.num_envs)
         dones = terminated | truncated
         ended = np.flatnonzero(dones).tolist()
         if self.restart is None and ended and "final_obs" not in env_infos:
@@ -102,9 +105,9 @@ class GymnasiumVecEnv(VecEnv):
                 infos[i]["terminal_observation"] = copied(self.observation_space, take(last_obs, i))
             reset_infos = env_infos
             if self.restart is not None:
-                obs, reset_infos = self.restart(self.env, dones)
-                check_batch(self.observation_space, obs, self.num_envs)
-                obs = copied(self.observation_space, obs)
+                with self.finishes_calls:
+                    obs, reset_infos = self.restart(self.env, dones)
+                obs = checked_batch(self.observation_space, obs, self.num_envs)
             for i in ended:
                 self.reset_infos[i] = info_of(reset_infos, i)
         return obs, rewards.astype(np.float32), dones, infos
@@ -148,7 +151,8 @@ class GymnasiumVecEnv(VecEnv):
             calls = [self.copies[i].get_wrapper_attr(method_name) for i in wanted]
             return [call(*method_args, **kwargs) for call in calls]
         if isinstance(self.env.unwrapped, AsyncVectorEnv) and method_name == "reset":
-            return reset_copies(self.env.unwrapped, wanted, **kwargs)
+            with self.finishes_calls:
+                return reset_copies(self.env.unwrapped, wanted, **kwargs)
         if wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
             return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
         raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
@@ -215,28 +219,6 @@ def reset_copies(env: AsyncVectorEnv, wanted: list[int], seed: int | None = None
     mask = np.isin(np.arange(env.num_envs), wanted)
     obs, infos = env.reset(seed=[seed] * env.num_envs, options={**(options or {}), "reset_mask": mask})
     return [(take(obs, i), info_of(infos, i)) for i in wanted]
-
-
-def check_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> None:
-    """Check the form of observations ``(n_envs, ...)``, or of a dict of them."""
-    if isinstance(space, spaces.Dict) and isinstance(obs, dict) and obs.keys() >= space.spaces.keys():
-        for key, part in space.spaces.items():
-            check_batch(part, obs[key], n_envs)
-        return
-    rows = np.asarray(obs)
-    if rows.shape[:1] != (n_envs,):
-        raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
-    # Rows of one array share their form, but some floats are whole numbers and some are not
-    share_form = isinstance(space, spaces.Box) and (rows.dtype.kind != "f" or np.dtype(space.dtype).kind == "f")
-    for i in range(1 if share_form else n_envs):
-        check_observation(space, rows[i], i)
-
-
-def copied(space: spaces.Space[Any], obs: Any) -> Any:
-    """A copy without keys that the space lacks: environments may write the next observations into the same arrays."""
-    if isinstance(space, spaces.Dict):
-        return {key: copied(part, obs[key]) for key, part in space.spaces.items()}
-    return np.array(obs)
 
 
 def info_of(env_infos: dict[str, Any], i: int) -> dict[str, Any]:

@@ -143,14 +143,11 @@ def by_step(buffer: RolloutBuffer) -> tuple[Floats, Floats]:
 def training_batch(rollout: Rollout, buffer: RolloutBuffer, normalize: bool) -> Batch:
     """The used steps of a rollout, with the advantages and returns of the buffer, which a callback may have changed."""
     advantages, returns = by_step(buffer)
-    used = rollout.used
-    observations, actions = used_inputs(rollout)
     return Batch(
-        observations=observations,
-        actions=actions,
+        *used_inputs(rollout),
         weights=compute_weights(rollout, advantages, normalize),
-        returns=select(th.as_tensor(returns, device=rollout.actions.device), used),
-        values=None if rollout.values is None else select(rollout.values, used),
+        returns=select(th.as_tensor(returns, device=rollout.actions.device), rollout.used),
+        values=None if rollout.values is None else select(rollout.values, rollout.used),
     )
 
 

@@ -56,6 +56,8 @@ def natural_step(
     The parameters stay as they are, with a warning, where no such step is found.
     """
     parameters = [each for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
+    if not parameters:
+        return 0.0, 0.0
     g = to_vector(gradients)
     norm = finite_norm(g, "policy", "scaled rewards (VecNormalize)")
     # A schedule may fall to a target of 0
@@ -108,10 +110,10 @@ def divergence_from_now(policy: ActorCriticPolicy, obs: Any) -> Callable[[], th.
 
 
 def hessian_vector_product(output: th.Tensor, parameters: Parameters) -> Callable[[th.Tensor], th.Tensor]:
-    """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994)."""
-    gradients = th.autograd.grad(output, parameters, create_graph=True)
+    """``v ↦ H v`` for the Hessian H of an output (Pearlmutter, 1994); 0 for parameters that it does not depend on."""
+    gradients = th.autograd.grad(output, parameters, create_graph=True, materialize_grads=True)
     gradient = th.cat([each.flatten() for each in gradients])
-    return lambda v: to_vector(th.autograd.grad(gradient @ v, parameters, retain_graph=True))
+    return lambda v: to_vector(th.autograd.grad(gradient @ v, parameters, retain_graph=True, materialize_grads=True))
 
 
 def conjugate_gradients(product: Callable[[th.Tensor], th.Tensor], b: th.Tensor) -> th.Tensor:

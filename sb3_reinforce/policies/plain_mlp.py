@@ -60,7 +60,7 @@ class DivideLogits:
 def hooks_of(module: nn.Module) -> list[Any]:
     """All hooks that are registered on a module."""
     attributes = vars(module)
-    return [hook for name in HOOKS if attributes[name] for hook in attributes[name].values()]
+    return [hook for name in HOOKS for hook in attributes[name].values()]
 
 
 def temperature_hook(module: nn.Module) -> DivideLogits | None:

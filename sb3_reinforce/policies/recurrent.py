@@ -58,10 +58,10 @@ class MaskedLstmPolicy(MaskedPolicy, RecurrentPolicy, RecurrentActorCriticPolicy
         if self.critic is not None:
             self.critic = BesideMask(self.critic, self.n_actions)
 
-    def remember(self, recurrence: th.nn.RNNBase, features: th.Tensor, rows: Rows, critic: bool) -> th.Tensor:
+    def remember(self, recurrence: th.nn.RNNBase, features: th.Tensor, rows: Rows) -> th.Tensor:
         """The outputs of a recurrent network for n rows of sequences, with the mask behind them."""
         features, mask = split_mask(features, self.n_actions)
-        return th.cat([super().remember(recurrence, features, rows, critic), mask], dim=1)
+        return th.cat([super().remember(recurrence, features, rows), mask], dim=1)
 
     def _process_sequence(  # type: ignore[override]
         self, features: th.Tensor, lstm_states: Any, episode_starts: th.Tensor, lstm: th.nn.LSTM

@@ -113,9 +113,7 @@ class RecurrentPolicy(ActorCriticPolicy):
     def sequence_values(self, rows: Rows) -> th.Tensor:
         """V(o_0, ..., o_t) for each of n rows, shape ``(n, 1)``."""
         if self.lstm_critic is not None:
-            latent = self.remember(
-                self.lstm_critic, self.row_features(rows, self.vf_features_extractor), rows, critic=True
-            )
+            latent = self.remember(self.lstm_critic, self.row_features(rows, self.vf_features_extractor), rows)
         elif self.critic is not None:
             latent = self.critic(self.row_features(rows, self.vf_features_extractor))
         else:
@@ -125,7 +123,7 @@ class RecurrentPolicy(ActorCriticPolicy):
 
     def actor_memory(self, rows: Rows) -> th.Tensor:
         """The actor's memory after each of n rows, shape ``(n, n_hidden)``."""
-        return self.remember(self.lstm_actor, self.row_features(rows, self.pi_features_extractor), rows, critic=False)
+        return self.remember(self.lstm_actor, self.row_features(rows, self.pi_features_extractor), rows)
 
     def row_features(self, rows: Rows, extractor: nn.Module) -> th.Tensor:
         """The features of n rows, without padding; the rows may hold them already."""
@@ -133,13 +131,13 @@ class RecurrentPolicy(ActorCriticPolicy):
             return cast(th.Tensor, rows["features"])
         return BasePolicy.extract_features(self, rows["observations"], extractor)  # type: ignore[arg-type]
 
-    def remember(self, recurrence: nn.RNNBase, features: th.Tensor, rows: Rows, critic: bool) -> th.Tensor:
+    def remember(self, recurrence: nn.RNNBase, features: th.Tensor, rows: Rows) -> th.Tensor:
         """The outputs of a recurrent network for n rows of sequences, shape ``(n, n_hidden)``."""
         index, is_row = padded_index(rows["sequence"])
         longest_first = is_row.sum(0).argsort(descending=True)
         index = index[:, longest_first]
         is_row = is_row[:, longest_first]
-        state = initial_state(rows, index[0], critic)
+        state = initial_state(rows, index[0], recurrence is self.lstm_critic)
         network: Any = recurrence
         if not recurrence.training and th.is_grad_enabled():
             # cuDNN differentiates no pass in evaluation mode

@@ -74,13 +74,13 @@ class NumpyActor:
         # The rest is what is_current compares
         self.layers = layers
         self.addresses = addresses_of(policy, layers)
-        self.distribution = policy.action_dist
+        self.action_dist = policy.action_dist
         self.mlp_extractor = policy.mlp_extractor
         self.extractor = [policy.pi_features_extractor, *policy.pi_features_extractor.children()]
         body = policy.mlp_extractor.policy_net
         parts = [policy, self.mlp_extractor, body, *self.extractor, *before, *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
-        self.dicts = [vars(self.distribution), *map(vars, parts), *hooks]
+        self.dicts = [vars(self.action_dist), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
 
     def act(self, obs: Any) -> Acted:
@@ -88,7 +88,7 @@ class NumpyActor:
         if self.with_log_prob:
             # Copies, since a callback may change the parameters in place
             self.outputs.append(outputs.copy())
-            if isinstance(self.distribution, DiagGaussianDistribution):
+            if isinstance(self.action_dist, DiagGaussianDistribution):
                 self.log_stds.append(np.broadcast_to(self.policy.log_std.detach().numpy(), outputs.shape).copy())
         return self.sample(outputs).reshape(self.shape), None, None
 
@@ -98,7 +98,7 @@ class NumpyActor:
         outputs = th.as_tensor(np.concatenate(self.outputs))
         rows = as_policy_actions(th.as_tensor(actions).flatten(0, 1), self.policy.action_space)
         log_std = [th.as_tensor(np.concatenate(self.log_stds))] if self.log_stds else []
-        log_prob: th.Tensor = self.distribution.proba_distribution(outputs, *log_std).log_prob(rows)
+        log_prob: th.Tensor = self.action_dist.proba_distribution(outputs, *log_std).log_prob(rows)
         return log_prob.numpy()
 
     def is_current(self, policy: ActorCriticPolicy) -> bool:
@@ -106,7 +106,7 @@ class NumpyActor:
         return (
             policy is self.policy
             and sum(map(len, self.dicts)) == self.n_entries
-            and policy.action_dist is self.distribution
+            and policy.action_dist is self.action_dist
             and [policy.pi_features_extractor, *policy.pi_features_extractor.children()] == self.extractor
             and policy.mlp_extractor is self.mlp_extractor
             and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers

@@ -102,7 +102,7 @@ def evaluate_candidates(
     on_step: Callable[[CandidateStep], None],
 ) -> np.ndarray:
     """Unscaled returns Σ_t r_t of candidates ``(m, n)``, shape ``(m, n_episodes)``; ``seeds`` has this shape too."""
-    original = original_reward_of(env)
+    original, _ = original_reward_of(env)
     returns = np.zeros((len(thetas), n_episodes))
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round

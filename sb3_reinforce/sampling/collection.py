@@ -39,7 +39,7 @@ class Extent:
         self.n_steps = n_steps
         self.max_episode_steps = max_episode_steps
         self.remaining = quota.copy()
-        self.starts = np.zeros_like(quota)
+        self.started_at = np.zeros_like(quota)
         # The first step of the longest episode that is waited for
         self.first_step = 0
         self.is_complete = False
@@ -60,9 +60,9 @@ class Extent:
         """Count the episodes that ended with this step; return the environments whose episode is in the quota."""
         counted = np.flatnonzero(dones & (self.remaining > 0))
         self.remaining[counted] -= 1
-        self.starts[counted] = n_steps
+        self.started_at[counted] = n_steps
         self.is_complete = not self.remaining.any()
-        self.first_step = int(self.starts[self.remaining > 0].min(initial=n_steps))
+        self.first_step = int(self.started_at[self.remaining > 0].min(initial=n_steps))
         return list(counted.tolist())
 
 
@@ -147,11 +147,12 @@ def collect(
 
 
 def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:
-    """Make arrays float32 where a Box has an integer dtype, since VecNormalize and Gaussian policies return floats."""
+    """Make arrays float32 where a Box is of integers or float16: VecNormalize and Gaussian policies return float32."""
 
     def fitted(rows: np.ndarray, given: Any) -> np.ndarray:
-        gives_fractions = np.asarray(given).dtype.kind == "f" and rows.dtype.kind != "f"
-        return rows.astype(np.float32) if gives_fractions else rows
+        dtype = np.asarray(given).dtype
+        is_too_coarse = rows.dtype.kind != "f" or rows.dtype.itemsize < min(4, dtype.itemsize)
+        return rows.astype(np.float32) if dtype.kind == "f" and is_too_coarse else rows
 
     buffer.observations = map_parts(fitted, buffer.observations, obs)
     if isinstance(action_space, spaces.Box):
@@ -164,18 +165,16 @@ def write_step(
     """Write what is known before the environments step."""
     write_row(buffer.observations, step, obs)
     write_row(buffer.actions, step, actions)
-    if values is not None:
-        write_row(buffer.values, step, values)
-    if log_probs is not None:
-        write_row(buffer.log_probs, step, log_probs)
+    write_row(buffer.values, step, values)
+    write_row(buffer.log_probs, step, log_probs)
 
 
 def write_row(rows: Any, step: int, values: Any) -> None:
-    """``rows[step] = values``, for an array of shape ``(n_steps, n_envs, ...)`` or a dict of them."""
+    """``rows[step] = values``, for an array of shape ``(n_steps, n_envs, ...)`` or a dict of them; None is left out."""
     if isinstance(rows, dict):
         for key, part in rows.items():
             write_row(part, step, values[key])
-    else:
+    elif values is not None:
         # Actions and observations of one number lack the last dimension
         rows[step] = values if values.ndim == rows.ndim - 1 else values.reshape(rows.shape[1:])
 

@@ -1,7 +1,7 @@
 """VecNormalize during a comparison: one scale for all candidates, which learns from all steps afterwards."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import cast
 
 import numpy as np
@@ -54,23 +54,20 @@ class ObservationStatistics:
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
 
-def original_reward_of(env: VecEnv) -> Callable[[], np.ndarray] | None:
-    """The method for the rewards below VecNormalize; None without one, or where a wrapper above it may change them."""
+def original_reward_of(env: VecEnv) -> tuple[Callable[[], np.ndarray] | None, VecEnv]:
+    """The method for the rewards below VecNormalize, or None; and the first VecEnv from above that may change them."""
     found = None
     while isinstance(env, VecNormalize) or type(env).step_wait in KEEP_REWARDS:
         if isinstance(env, VecNormalize) and env.norm_reward:
             found = env.get_original_reward
         env = cast(VecEnvWrapper, env).venv
-    return found
+    return found, env
 
 
 def check_scale(env: VecEnv | None) -> None:
     """Refuse a VecNormalize whose scale of the rewards is used, but would never be learned."""
-    learning = [each for each in normalizers(env) if each.training and each.norm_reward]
-    if learning and env is not None and original_reward_of(env) is None:
-        changing = env
-        while isinstance(changing, VecNormalize) or type(changing).step_wait in KEEP_REWARDS:
-            changing = cast(VecEnvWrapper, changing).venv
+    original, changing = original_reward_of(cast(VecEnv, env))
+    if original is None and any(each.training and each.norm_reward for each in normalizers(env)):
         raise ValueError(
             f"{type(changing).__name__} lies above VecNormalize and may change rewards. FiniteDifference compares "
             "candidates at a frozen scale, which VecNormalize would never learn: set norm_reward=False, or "
@@ -81,27 +78,22 @@ def check_scale(env: VecEnv | None) -> None:
 @contextmanager
 def unclipped(env: VecEnv | None) -> Iterator[None]:
     """Let no VecNormalize clip rewards in the block, so that their sums are multiples of the utility."""
-    before = [(each, each.clip_reward) for each in normalizers(env)]
-    try:
-        for each, _ in before:
+    with ExitStack() as undo:
+        for each in normalizers(env):
+            undo.callback(setattr, each, "clip_reward", each.clip_reward)
             each.clip_reward = np.inf
         yield
-    finally:
-        for each, bound in before:
-            each.clip_reward = bound
 
 
 @contextmanager
 def frozen(env: VecEnv | None) -> Iterator[list[ObservationStatistics]]:
     """Freeze each VecNormalize that is learning; unless an error ends the block, they then learn what was observed."""
     observed = [ObservationStatistics(each) for each in normalizers(env) if each.training]
-    try:
+    with ExitStack() as undo:
         for each in observed:
+            undo.callback(each.thaw)
             each.freeze()
         yield observed
-    finally:
-        for each in observed:
-            each.thaw()
     for each in observed:
         for key, seen in each.seen.items():
             if seen.count:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.common.moments import seen_since
 from sb3_reinforce.estimation import BASELINES
+from sb3_reinforce.policies.evaluation import temperature_of
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 from sb3_reinforce.sampling.collection import ROWS
 from sb3_reinforce.sampling.columns import Columns, join
@@ -213,9 +214,16 @@ def test_verbose_and_tensorboard_log_may_differ(tmp_path):
     def learn(rank):
         folder = str(tmp_path) if rank == 0 else None
         model = make("steps", corridors(1), verbose=1 - rank, tensorboard_log=folder).learn(32)
-        return model.num_timesteps, model.verbose
+        return model.num_timesteps, model.verbose, model.tensorboard_log
 
-    assert in_processes(2, learn, tmp_path) == [(32, 1), (32, 0)]
+    assert in_processes(2, learn, tmp_path) == [(32, 1, str(tmp_path)), (32, 0, None)]
+
+
+def test_all_processes_end_with_the_last_temperature(tmp_path):
+    def learn(rank):
+        return temperature_of(make("steps", corridors(1), temperature=lambda left: 1 + left).learn(16).policy)
+
+    assert in_processes(2, learn, tmp_path) == [1.0, 1.0]
 
 
 def actions_of_all(rank, path):

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from callbacks import At
 from environments import Corridor, Faulty
+from gymnasium.vector import AsyncVectorEnv
 from models import both, make
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_reinforce import GymnasiumVecEnv
 
 # Python warns of fork beside threads; here it is what is tested
 pytestmark = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
@@ -191,6 +194,20 @@ def test_an_interrupted_step(number, kind, workers):
     model.learn(90, reset_num_timesteps=False)
     made = [after - each for after, each in zip(env.get_attr("n_steps"), before, strict=True)]
     assert made == [(model.num_timesteps - n_steps) // 3] * 3
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_an_interrupted_step_of_gymnasiums_processes(mode):
+    """It is finished first: what its processes have answered could not be told from their later answers."""
+    envs = AsyncVectorEnv(faulty(fault="SIGTERM", at=20), context="fork", autoreset_mode=mode)
+    model = make("steps", GymnasiumVecEnv(envs))
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(400)
+    before, n_steps = envs.get_attr("n_steps"), model.num_timesteps
+    model.learn(90, reset_num_timesteps=False)
+    made = [after - each for after, each in zip(envs.get_attr("n_steps"), before, strict=True)]
+    assert made == [(model.num_timesteps - n_steps) // 3] * 3
+    envs.close()
 
 
 def test_workers_are_closed_after_an_interrupted_step(workers):

@@ -10,7 +10,7 @@ import torch as th
 from enumeration import make_model
 from environments import Corridor
 from gymnasium import spaces
-from models import Dropping, Normalized, make
+from models import Dropping, Normalized, make, moved_by_learning
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -282,6 +282,25 @@ def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
     weight = th.nn.Parameter(th.zeros(1))
     kl = line_search([weight], th.ones(1), 10.0, lambda: (weight**8).sum(), 0.01)
     assert 0.01 / 2**8 <= kl <= 0.012
+
+
+class OwnEntropy(ActorCriticPolicy):
+    """Adds a parameter to the entropy, on which the distribution does not depend."""
+
+    def _build(self, lr_schedule):
+        self.bonus = th.nn.Parameter(th.zeros(()))
+        super()._build(lr_schedule)
+
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, log_prob, entropy + self.bonus
+
+
+def test_parameters_on_which_the_distribution_does_not_depend():
+    model = make("steps", Corridor(), OwnEntropy, step="natural", ent_coef=0.01).learn(32)
+    assert model.policy.bonus > 0 and model.logger.name_to_value["train/kl"] > 0
+    model.policy.optimizer = th.optim.Adam(model.policy.value_net.parameters())
+    assert "action_net.weight" not in moved_by_learning(model, 32)
 
 
 class OtherFeatures(ActorCriticPolicy):

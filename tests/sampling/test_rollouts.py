@@ -264,18 +264,25 @@ class Integers(gym.Env):
         return self.np_random.integers(100, size=2, dtype=np.uint8), 0.0, False, False, {}
 
 
+class Halves(Integers):
+    observation_space = gym.spaces.Box(0, 100, (2,), np.float16)
+    action_space = gym.spaces.Box(0, 3, (1,), np.float16)
+
+
 @pytest.mark.parametrize("dictionary", [False, True])
-def test_training_sees_the_fractions_that_the_policy_saw_and_drew(dictionary):
-    """VecNormalize returns floats for a Box of integers, and the Gaussian policy draws them."""
-    space = gym.spaces.Dict({"a": Integers.observation_space})
+@pytest.mark.parametrize("env_class", [Integers, Halves])
+def test_training_sees_the_fractions_that_the_policy_saw_and_drew(env_class, dictionary):
+    """VecNormalize returns float32 for a Box of integers or float16, and the Gaussian policy draws it."""
+    space = gym.spaces.Dict({"a": env_class.observation_space})
     in_dicts = partial(gym.wrappers.TransformObservation, func=lambda obs: {"a": obs}, observation_space=space)
-    env = make_vec_env(lambda: in_dicts(Integers()) if dictionary else Integers(), 2, seed=0)
+    env = make_vec_env(lambda: in_dicts(env_class()) if dictionary else env_class(), 2, seed=0)
     policy = "MultiInputPolicy" if dictionary else "MlpPolicy"
     model = REINFORCE(policy, VecNormalize(env), learning_rate=0.0, n_steps=8, seed=0, device="cpu")
     model.learn(16, lambda *_: True)
     rollout = model.rollout
     observations = rollout.observations["a"] if dictionary else rollout.observations
     assert (observations % 1 > 0).any() and (rollout.actions % 1 > 0).any()
+    assert observations.dtype == rollout.actions.dtype == th.float32
     flat = observations.flatten(0, 1)
     _, log_prob, _ = model.policy.evaluate_actions({"a": flat} if dictionary else flat, rollout.actions.flatten(0, 1))
     np.testing.assert_allclose(log_prob.detach(), model.rollout_buffer.log_probs.flatten(), rtol=1e-5, atol=1e-5)
