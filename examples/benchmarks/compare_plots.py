@@ -44,6 +44,10 @@ REFERENCES = {
     "Walker2d-v5": (1.8, 3479.0),
     "Swimmer-v5": (0.8, 281.6),
     "Ant-v5": (-48.0, 1327.0),
+    # Without velocities in the observations, on which random actions do not depend; RecurrentPPO in benchmark.md
+    "CartPoleNoVel-v1": (23.7, 500.0),
+    "MountainCarContinuousNoVel-v0": (-33.3, 91.5),
+    "PendulumNoVel-v1": (-1207.6, -217.9),
     # For the tasks below benchmark.md has no PPO. The return at which Gymnasium calls CarRacing solved
     "CarRacing-v3": (-32.6, 900.0),
     # PPO at 1M steps in Tianshou's examples/mujoco/README.md, on versions 2 and 3

@@ -180,6 +180,7 @@ def test_a_summary_says_what_it_leaves_out(missing, sentence, drawn, plots, caps
     plots.plt.close("all")
 
 
-def test_every_task_with_settings_has_a_reference(plots):
-    published = yaml.safe_load((HYPERPARAMS / "reinforce.yml").read_text())
+@pytest.mark.parametrize("name", ["reinforce", "reinforce_lstm"])
+def test_every_task_with_settings_has_a_reference(name, plots):
+    published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
     assert plots.REFERENCES.keys() >= published.keys() - {"default", "atari", "train_env_kwargs"}
