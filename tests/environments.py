@@ -139,7 +139,7 @@ class Faulty(Corridor):
     Episodes of seven steps; something goes wrong at step ``at`` of its life, or at reset ``at``.
 
     The fault is "reward", "observation" or "first observation", which are ``value`` then; "raise" or "die", "in step"
-    or "in reset"; or the name of a signal that the learner gets in the middle of a step.
+    or "in reset"; or a signal, such as "SIGINT" or "SIGINT in reset", that the learner gets meanwhile.
     """
 
     def __init__(
@@ -181,8 +181,9 @@ class Faulty(Corridor):
             raise self.value or OSError("the simulator has gone")
         if self.fault == f"die in {when}":
             os.kill(os.getpid(), signal.SIGKILL)
-        if self.fault in signal.Signals.__members__ and when == "step":
-            os.kill(os.getppid(), signal.Signals[self.fault])
+        name, _, place = self.fault.partition(" in ")
+        if name in signal.Signals.__members__ and when == (place or "step"):
+            os.kill(os.getppid(), signal.Signals[name])
             # The answer comes when the learner has long stopped waiting for it
             time.sleep(0.2)
 

@@ -86,7 +86,7 @@ def seeded(policy: BasePolicy, seed: int) -> Iterator[None]:
 
 
 def check_model(model: Any, kinds: tuple[type, ...] = (REINFORCE,), independent: bool = False) -> None:
-    """Check a model's kind and that it has environments; with ``independent`` also that its episodes are."""
+    """Check a model's kind, its environments, and with ``independent`` that its episodes are independent samples."""
     allowed = f"a {' or '.join(kind.__name__ for kind in kinds)}"
     if isinstance(model, OnPolicyAlgorithm):
         allowed += " (whose set_parameters(..., exact_match=False) takes the policy of an A2C or PPO)"

@@ -121,7 +121,8 @@ class GymnasiumVecEnv(VecEnv):
         if self.copies is not None:
             values = [single.get_wrapper_attr(attr_name) for single in self.copies]
         elif hasattr(self.env.unwrapped, "get_attr"):
-            values = self.env.unwrapped.get_attr(attr_name)
+            with self.finishes_calls:
+                values = self.env.unwrapped.get_attr(attr_name)
         else:
             values = [getattr(self.env.unwrapped, attr_name)] * self.num_envs
         return [values[i] for i in self._get_indices(indices)]
@@ -130,7 +131,8 @@ class GymnasiumVecEnv(VecEnv):
         """Whether the copies have an attribute."""
         if isinstance(self.env.unwrapped, AsyncVectorEnv):
             # Gymnasium closes processes that are asked for an attribute that they lack
-            return all(self.env.unwrapped.call("has_wrapper_attr", attr_name))
+            with self.finishes_calls:
+                return all(self.env.unwrapped.call("has_wrapper_attr", attr_name))
         return super().has_attr(attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -138,7 +140,8 @@ class GymnasiumVecEnv(VecEnv):
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"indices must be None to set {attr_name!r} in a vector environment, got {indices}")
         if hasattr(self.env.unwrapped, "set_attr"):
-            self.env.unwrapped.set_attr(attr_name, [value] * self.num_envs)
+            with self.finishes_calls:
+                self.env.unwrapped.set_attr(attr_name, [value] * self.num_envs)
         else:
             setattr(self.env.unwrapped, attr_name, value)
 
@@ -154,7 +157,8 @@ class GymnasiumVecEnv(VecEnv):
             with self.finishes_calls:
                 return reset_copies(self.env.unwrapped, wanted, **kwargs)
         if wanted == list(range(self.num_envs)) and hasattr(self.env.unwrapped, "call"):
-            return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
+            with self.finishes_calls:
+                return list(self.env.unwrapped.call(method_name, *method_args, **kwargs))
         raise NotImplementedError(f"{self.env} has no single copies to call {method_name!r} on")
 
     def env_is_wrapped(
@@ -165,12 +169,14 @@ class GymnasiumVecEnv(VecEnv):
         if self.copies is not None:
             found = [is_wrapped(single, wrapper_class) for single in self.copies]
         elif isinstance(self.env.unwrapped, AsyncVectorEnv):
-            found = [f"<{wrapper_class.__name__}<" in text for text in self.env.unwrapped.call("__str__")]
+            with self.finishes_calls:
+                found = [f"<{wrapper_class.__name__}<" in text for text in self.env.unwrapped.call("__str__")]
         return [found[i] for i in self._get_indices(indices)]
 
     def get_images(self) -> list[np.ndarray | None]:
         """A picture of each copy; None where there is none."""
-        pictures: Any = self.env.render()
+        with self.finishes_calls:
+            pictures: Any = self.env.render()
         return [None] * self.num_envs if pictures is None else list(pictures)
 
 

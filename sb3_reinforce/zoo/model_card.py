@@ -80,8 +80,9 @@ def write_card(folder: str, name: str, env_id: str, n_episodes: int = 100, exp_i
     seed = arguments["seed"] + 1000
     options = {"seed": seed, "should_render": False, "vec_env_cls": DummyVecEnv}
     env = utils.create_test_env(env_id, 10, stats, hyperparams=hyperparams, env_kwargs=env_kwargs, **options)
-    # Without the environments, which load would seed as in training
-    agent = ALGOS[name].load(model)
+    agent = ALGOS[name].load(model, env=env)
+    # load has seeded them as in training
+    env.seed(seed)
     mean, std = evaluate_policy(agent, env, n_episodes)
     env.close()
     arguments["n_timesteps"] = max(arguments["n_timesteps"], 0) or int(settings["n_timesteps"])

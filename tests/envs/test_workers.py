@@ -196,18 +196,31 @@ def test_an_interrupted_step(number, kind, workers):
     assert made == [(model.num_timesteps - n_steps) // 3] * 3
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
-def test_an_interrupted_step_of_gymnasiums_processes(mode):
+@pytest.mark.parametrize(
+    ("kind", "fault", "at"),
+    [
+        ("steps", "SIGTERM", 20),
+        ("steps", "SIGINT", 20),
+        ("steps", "SIGTERM in reset", 1),
+        # After an episode
+        ("steps", "SIGTERM in reset", 2),
+        # By env_method, with a seed
+        ("search", "SIGTERM in reset", 3),
+    ],
+)
+def test_an_interrupted_call_of_gymnasiums_processes(kind, fault, at):
     """It is finished first: what its processes have answered could not be told from their later answers."""
-    envs = AsyncVectorEnv(faulty(fault="SIGTERM", at=20), context="fork", autoreset_mode=mode)
-    model = make("steps", GymnasiumVecEnv(envs))
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(400)
-    before, n_steps = envs.get_attr("n_steps"), model.num_timesteps
-    model.learn(90, reset_num_timesteps=False)
-    made = [after - each for after, each in zip(envs.get_attr("n_steps"), before, strict=True)]
-    assert made == [(model.num_timesteps - n_steps) // 3] * 3
-    envs.close()
+    envs = AsyncVectorEnv(faulty(fault=fault, at=at), context="fork", autoreset_mode="Disabled")
+    try:
+        model = make(kind, GymnasiumVecEnv(envs), **({"common_random_numbers": True} if kind == "search" else {}))
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(400)
+        before, n_steps = envs.get_attr("n_steps"), model.num_timesteps
+        model.learn(90, reset_num_timesteps=False)
+        made = [after - each for after, each in zip(envs.get_attr("n_steps"), before, strict=True)]
+        assert made == [(model.num_timesteps - n_steps) // 3] * 3
+    finally:
+        envs.close(terminate=True)
 
 
 def test_workers_are_closed_after_an_interrupted_step(workers):

@@ -55,10 +55,11 @@ def test_a_default_is_fitted_to_the_spaces(env, left_out, tmp_path):
 
 def test_games_of_atari_have_their_entry_or_need_a_conf_file(monkeypatch, capsys):
     monkeypatch.setitem(gym.registry, "Game-v0", GAME)
-    settings = make_experiment(argparse.Namespace(), "reinforce", "Game-v0", "", n_timesteps=64).read_hyperparameters()[
-        0
-    ]
-    assert settings["policy"] == "CnnPolicy"
+    experiment = make_experiment(argparse.Namespace(), "reinforce", "Game-v0", "", n_timesteps=64)
+    settings, _ = experiment.read_hyperparameters()
+    of_a2c = yaml.safe_load((Path(rl_zoo3.__file__).parent / "hyperparams" / "a2c.yml").read_text())["atari"]
+    for key in ("env_wrapper", "frame_stack", "n_envs", "policy"):
+        assert settings[key] == of_a2c[key]
     message = message_of(capsys, "train", "--algo", "finite_difference", "--env", "Game-v0")
     assert "must have an entry Game-v0 or atari" in message
 
