@@ -20,7 +20,8 @@ seed = 0
 th.set_num_threads(1)
 
 # %% [markdown]
-# The traps are tasks of a few steps, in which a function gives the reward.
+# Two traps are CartPole with a wrong learning rate. The others are tasks of a few steps, in which a function gives the
+# reward.
 
 
 # %%

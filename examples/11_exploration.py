@@ -47,7 +47,7 @@ for min_std in (0.0, 1.5):
     policy_kwargs = {"net_arch": [], "log_std_init": np.log(0.3)}
     env = make_vec_env(Hills, 8, seed=seed)
     model = REINFORCE("MlpPolicy", env, learning_rate=0.04, min_std=min_std, policy_kwargs=policy_kwargs, **common)
-    model.policy.action_net.bias.data.fill_(-1.0)
+    th.nn.init.constant_(model.policy.action_net.bias, -1.0)
     model.learn(10_000)
     means[min_std] = float(model.predict(np.ones(1, dtype=np.float32), deterministic=True)[0][0])
     print(f"min_std = {min_std}: the mean action is {means[min_std]:+.2f}")
@@ -57,10 +57,12 @@ assert means[0.0] < -0.7 and means[1.5] > 1
 # ## Temperature and entropy
 #
 # Two arguments keep a policy of discrete actions random, and both can be schedules. `temperature` divides the logits:
-# $\pi(a \mid s) \propto \exp(z_a / T)$. `ent_coef` adds $c \sum_t \nabla H(\pi(\cdot \mid s_t))$ to the gradient, which
-# for one step is the gradient of $E[\text{return}] + c H$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of
-# standard deviation 1. The policy starts with a probability of 0.999 for the worst arm, and hardly sees the others.
-# Without a schedule it mostly stays there. A schedule lets it try them first, and decide later.
+# $\pi(a \mid s) \propto \exp(z_a / T)$. `ent_coef` is the weight $c$ of the entropy $H$ (Williams and Peng, 1991). It
+# adds $c \sum_t \nabla H(\pi(\cdot \mid s_t))$ to the gradient, which for one step is the gradient of
+# $E[\text{return}] + c H$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. At
+# temperature 1 the policy starts with a probability of 0.999 for the worst arm, and hardly sees the others. The
+# temperature 5 lowers this probability to 0.71. Without a schedule it mostly stays there. A schedule lets it try them
+# first, and decide later.
 
 
 # %%
@@ -95,7 +97,8 @@ def best_arm(arguments, seed):
     arguments = {**common, "learning_rate": 0.03, "policy_kwargs": {"net_arch": []}, **arguments, "seed": seed}
     model = REINFORCE("MlpPolicy", make_vec_env(Arms, 8, seed=seed), **arguments)
     # At temperature 1 the worst arm has the probability 0.999
-    model.policy.action_net.bias.data[0] = 8.0
+    with th.no_grad():
+        model.policy.action_net.bias[0] = 8.0
     return probabilities(model.learn(10_000))[2].item()
 
 
@@ -111,8 +114,9 @@ assert np.mean(neither) < 0.5 and np.min(scheduled) > 0.6
 #
 # A corridor of three cells that look alike (Sutton and Barto, 2018, example 13.1). In the middle cell left and right
 # are exchanged. Each step costs 1 until the end on the right is reached. Always right and always left never arrive; the
-# best policy without a memory goes right with probability $2 - \sqrt 2 \approx 0.59$, and needs 11.7 steps. Q-learning
-# with greedy actions cannot represent it. A softmax can. (With a memory three steps would do: right, left, right.)
+# best policy without a memory goes right with probability $2 - \sqrt 2 \approx 0.59$, and needs 11.7 steps. A policy
+# that is greedy in action values is deterministic and cannot represent this one. A softmax can. (With a memory three
+# steps would do: right, left, right.)
 
 
 # %%

@@ -2,8 +2,8 @@
 # # What is an action mask worth?
 #
 # Each of 40 doors is opened by the key with its number. At each door 29 or 30 keys are known not to fit: a mask forbids
-# them. A policy without the mask could learn to avoid wrong keys, too. How many doors does each policy open after
-# 4,000 steps of training?
+# them. The discount is 0, since no key changes a later door. A policy without the mask could learn to avoid wrong keys,
+# too. How many doors does each policy open after 4,000 steps of training?
 
 # %%
 import gymnasium as gym

@@ -93,7 +93,8 @@ def score(memory):
         model = RecurrentREINFORCE("MlpLstmPolicy", env, policy_kwargs=policy_kwargs, **settings)
         if memory == "lstm":
             # PyTorch's order of the gates: input, forget, cell, output
-            model.policy.lstm_actor.bias_ih_l0.data[32:64] = arguments.forget_bias
+            with th.no_grad():
+                model.policy.lstm_actor.bias_ih_l0[32:64] = arguments.forget_bias
     model.learn(arguments.timesteps, progress_bar=True)
     eval_env = make_vec_env(TMaze, n_envs=16, seed=1000 + arguments.seed, env_kwargs=env_kwargs)
     mean, _ = evaluate_policy(model, eval_env, n_eval_episodes=200)

@@ -63,10 +63,12 @@ assert report.share.low > 0.5
 assert report.gains[8].low > 1
 
 # %% [markdown]
+# Here groups of four and of eight gain about the same: a larger group has a better baseline, but a rollout then has
+# fewer starts.
+#
 # ## Both at the same number of episodes
 #
-# Groups of four and of eight gain about the same: larger groups have a better baseline, but fewer starts. All policies
-# are evaluated on the same 320 days. The best one drives to the nearest depot.
+# All policies are evaluated on the same 320 days. The best one drives to the nearest depot.
 
 
 # %%

@@ -13,11 +13,12 @@
 # $G_t$ over the other episodes that reach step $t$.
 #
 # Why the scores $\nabla_\theta \log \pi_\theta$? For the probability $p_\theta$ of an episode,
-# $\nabla p_\theta = p_\theta \nabla \log p_\theta$, so the gradient of an expectation is an expectation too:
-# $\nabla \sum p_\theta \cdot \text{return} = E[\text{return} \cdot \nabla \log p_\theta]$. The dynamics of the cart
-# do not depend on $\theta$ and drop out of $\nabla_\theta \log p_\theta$. Only the scores remain. $G_t$ may replace the
-# return, since an action does not change earlier rewards (page 5). A $b_t$ that depends neither on $a_t$ nor on what
-# follows it may be subtracted, since scores have mean zero (pages 2 and 6).
+# $\nabla p_\theta = p_\theta \nabla \log p_\theta$, so the gradient of an expectation, a sum over all episodes, is an
+# expectation too: $\nabla \sum p_\theta \cdot \text{return} = E[\text{return} \cdot \nabla \log p_\theta]$. In
+# $\log p_\theta = \log p(s_0) + \sum_t [\log \pi_\theta(a_t \mid s_t) + \log p(s_{t+1} \mid s_t, a_t)]$, with states
+# $s_t$ and actions $a_t$, the dynamics of the cart do not depend on $\theta$ and drop out of the gradient. Only the
+# scores remain. $G_t$ may replace the return, since an action does not change earlier rewards (page 5). A $b_t$ that
+# depends neither on $a_t$ nor on what follows it may be subtracted, since scores have mean zero (pages 2 and 6).
 
 # %%
 import torch as th
@@ -51,7 +52,8 @@ until_solved = EvalCallback(
     make_vec_env("CartPole-v1", n_envs=20, seed=1000 + seed),
     callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=490),
     n_eval_episodes=20,
-    eval_freq=500,
+    # It counts calls, each a step of all environments
+    eval_freq=4_000 // env.num_envs,
     verbose=0,
 )
 model.learn(200_000, callback=until_solved, progress_bar=True)

@@ -84,8 +84,8 @@ assert abs(by_episode.mean(0)[1] - gradient) < 1e-6
 
 # %% [markdown]
 # `learn(1)` trains for at least one step, which is one update here. It draws its own three episodes, and moves the
-# weight by 0.1 times their gradient. The bias of Right and both parameters of Left move as far, so
-# $\pi(\text{Right})$ changes more than by hand.
+# weight by 0.1 times their gradient. The bias of Right moves as far, and both parameters of Left as far in the opposite
+# direction. The difference of the logits, which is the $\theta$ from above, changes by four times as much.
 
 # %%
 model.learn(1)
@@ -97,10 +97,10 @@ assert abs(model.policy.action_net.weight[1].item() - expected) < 1e-6
 # %% [markdown]
 # ## The score has mean zero
 #
-# $E_{a \sim \pi}[\nabla \log \pi(a)] = 0$ for every policy. So a constant that is subtracted from all returns leaves
-# the expected gradient alone. For a softmax the score of the logits is $1(a' = a) - \pi(a')$, and its mean can be
-# computed exactly. For a Gaussian the score of $\mu$ is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero
-# up to its standard error.
+# $E_{a \sim \pi}[\nabla \log \pi(a)] = 0$ for every differentiable policy whose set of possible actions does not depend
+# on $\theta$. So a constant that is subtracted from all returns leaves the expected gradient alone. For a softmax the
+# score of the logits is $1(a' = a) - \pi(a')$, and its mean can be computed exactly. For a Gaussian the score of $\mu$
+# is $(a - \mu) / \sigma^2$, and the mean of 100,000 samples is zero up to its standard error.
 
 # %%
 probabilities = th.softmax(th.randn(4), dim=0)
@@ -115,8 +115,9 @@ assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.m
 # ## When all returns are positive
 #
 # Three actions with returns 8, 10 and 12. Without a baseline each episode pushes its action up, only by different
-# amounts. With the mean of the batch the average action is left alone. The mean contains the return that it is
-# subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does not.
+# amounts. With the mean of the batch the action with the average return is left alone. The mean contains the return
+# that it is subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does
+# not.
 
 # %%
 rollout = replace(sample(make_model(8.0, 10.0, 12.0), 3), returns=th.tensor([[8.0], [10.0], [12.0]], dtype=th.float64))

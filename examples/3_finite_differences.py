@@ -4,10 +4,10 @@
 # The oldest way to measure a slope: move a little, and see what changes. Policy and simulator may be black boxes. Along
 # a perturbation $\delta$ of the parameters,
 #
-# $$\text{forward: } \delta \, \hat g \approx U(\theta + \delta) - U(\theta), \qquad
-#   \text{central: } 2 \delta \, \hat g \approx U(\theta + \delta) - U(\theta - \delta).$$
+# $$\text{forward: } \delta^T \hat g \approx U(\theta + \delta) - U(\theta), \qquad
+#   \text{central: } 2 \delta^T \hat g \approx U(\theta + \delta) - U(\theta - \delta).$$
 #
-# For $n$ parameters these take $n + 1$ and $2n$ evaluations of $U$.
+# For a single parameter $\delta$ is a number. For $n$ parameters these take $n + 1$ and $2n$ evaluations of $U$.
 
 # %%
 import matplotlib.pyplot as plt
@@ -44,8 +44,9 @@ th.testing.assert_close(central_difference(bowl, theta, deltas), -2 * theta)
 # %% [markdown]
 # ## Curvature against noise
 #
-# A utility is a mean of random returns, so each evaluation carries noise. Let $U(x) = x^2$, measured at $x = 2$ with
-# standard error $\sigma = 0.1$. The root mean square error of the forward difference is then
+# A utility is a mean of random returns, so each evaluation carries noise. Let $U(x) = x^2$, with the slope wanted at
+# $x = 2$. Each evaluation has an independent error of standard deviation $\sigma = 0.1$. The root mean square error of
+# the forward difference is then
 #
 # $$\sqrt{\left(\tfrac{\delta}{2} U''\right)^2 + 2 \sigma^2 / \delta^2}:$$
 #
@@ -92,9 +93,9 @@ plt.show()
 # %% [markdown]
 # ## A signal below its noise
 #
-# Utilities of 50 rollouts with returns of standard deviation 1 have the standard error $1 / \sqrt{50} = 0.14$. At
-# $\delta = 0.01$ two of them, 4.23 and 4.41, give the slope 18, with the standard error $0.14 \sqrt 2 / 0.01 = 20$: it
-# may be all noise. Ten times the step would have a tenth of the noise.
+# Means of 50 returns with standard deviation 1 have the standard error $1 / \sqrt{50} = 0.14$. At $\delta = 0.01$ two
+# of them, 4.23 and 4.41, give the slope 18, with the standard error $0.14 \sqrt 2 / 0.01 = 20$: it may be all noise.
+# Ten times the step would have a tenth of the noise.
 
 # %%
 slope, standard_error = (4.41 - 4.23) / 0.01, 2**0.5 / 50**0.5 / 0.01
@@ -106,8 +107,8 @@ assert round(slope) == 18 and round(standard_error) == 20
 #
 # The regression gradient perturbs all parameters at once, $k$ times, and fits a plane to the utilities. The rule of
 # thumb is $k = 2n$. What the plane does not explain is noise or curvature, so the fit comes with a standard error for
-# each component. Here the utility is linear, so all that the plane does not explain is noise. Over many repetitions,
-# errors divided by their standard errors follow Student's $t$.
+# each component. Here the utility is linear and its noise Gaussian, so errors divided by their standard errors follow
+# Student's $t$.
 
 # %%
 slopes = th.tensor([2.0, -1.0, 0.5], dtype=th.float64)

@@ -50,21 +50,23 @@ print(f"ratio {variances[0].value / variances[1].value:.1f}")
 assert variances[0].value > 2.5 * variances[1].value
 
 # %% [markdown]
-# The signal-to-noise ratio is the squared norm of a mean divided by the variance. For the difference of the two its
-# interval contains 0: no signal is detected in the past rewards. In expectation there is none.
+# The signal-to-noise ratio is the squared norm of the expected gradient divided by the variance of one episode's
+# gradient. For the difference of the two gradients its interval contains 0: no signal is detected in the past rewards.
+# In expectation there is none.
 
 # %%
 difference = gradient_statistics(total - to_go)
-print("squared mean of the difference / its variance:", difference.snr)
+print("signal-to-noise ratio of the difference:", difference.snr)
 assert difference.snr.low <= 0 <= difference.snr.high
 
 # %% [markdown]
 # ## Where does the discount go?
 #
-# Ten switches one after the other, each worth 1 if it is turned on. The discounted utility is $U = \sum_t \gamma^t \,
-# \pi(\text{on} \mid t)$, so for a uniform policy its derivative with respect to the logit of "on" at $t$ is
-# $\gamma^t / 4$. The factor $\gamma^t$ comes with `discount_scores=True`. Most libraries leave it out, and so does this
-# package by default: then late actions count as much as early ones.
+# Ten switches one after the other, each worth 1 if it is turned on. The discounted utility is
+# $U = \sum_t \gamma^t \, \pi(\text{on} \mid t)$, so for a uniform policy its derivative with respect to the logit of
+# "on" at $t$ is $\gamma^t / 4$. The factor $\gamma^t$ comes with `discount_scores=True`. Most libraries leave it out,
+# and so does this package by default: then late actions count as much as early ones, and the direction is in general
+# not the gradient of any function (Nota and Thomas, 2020).
 
 
 # %%
@@ -110,12 +112,13 @@ plt.show()
 # %% [markdown]
 # ## Divided by episodes, or by steps?
 #
-# Half of the episodes take the short way: one step, return 2. The others take eleven steps and return 3. The long way
-# is better. A sum of gradients divided by the number of *steps* is a ratio of two random numbers, and gives long
-# episodes too little weight; with one episode per update it even points to the short way. Divided by the number of
-# *episodes* the gradient is unbiased (`normalize_by="episodes"`). The bias falls as the number of episodes in an update
-# grows. The default, `normalize_by="steps"`, is biased. It gives the updates the scale of A2C's. Here the sums divided
-# by steps are multiplied by the mean length, to compare them.
+# Half of the episodes take the short way: one step, return 2. The others take eleven steps and return 3. Only the first
+# action is a choice, so each episode has a single score. The long way is better. A sum of gradients divided by the
+# number of *steps* is a ratio of two random numbers, and gives long episodes too little weight; with one episode per
+# update it even points to the short way. Divided by the number of *episodes* the gradient is unbiased
+# (`normalize_by="episodes"`). The bias falls as the number of episodes in an update grows. The default,
+# `normalize_by="steps"`, is biased. It gives the updates the scale of A2C's. Here the sums divided by steps are
+# multiplied by the mean length, to compare them.
 
 # %%
 # The score of the logit of "short" is 1/2 for the short way and -1/2 for the long one

@@ -25,8 +25,12 @@ th.set_num_threads(1)
 # ## A bandit
 #
 # Two actions with rewards from $N(3, 4)$ and $N(5, 4)$, and gradients of 20 episodes. Here every variance has a
-# formula, for baselines that are known. The optimal baseline is the constant $b$ that minimizes the variance.
-# For the return $R$ and the score $S$ of an episode, the derivative of $E[\|(R - b) S\|^2]$ with respect to $b$ is 0 at
+# formula, for baselines that are known. The second number of $N(3, 4)$ is the variance. With $q = 1 - p$, the weights
+# and biases of both logits give $\|S\|^2 = 4 q^2$ for the better action, which has the probability $p$, and $4 p^2$ for
+# the other. The optimal baseline is the constant $b$ that minimizes the variance. The return of an episode is $R$, and
+# its score is $S = \sum_t \nabla \log \pi(a_t \mid s_t)$. The mean of $(R - b) S$ does not depend on $b$, so only
+# $E[\|(R - b) S\|^2]$ matters (Greensmith, Bartlett and Baxter, 2004). The derivative of $E[\|(R - b) S\|^2]$ with
+# respect to $b$ is 0 at
 #
 # $$b^* = \frac{E[R \, \|S\|^2]}{E[\|S\|^2]},$$
 #
@@ -56,7 +60,8 @@ names = ("none", "mean", "optimal")
 
 figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.6), sharey=True, layout="constrained")
 for ax, p in zip(axes, (0.5, 0.8), strict=True):
-    model.policy.action_net.bias.data = th.tensor([1 - p, p]).log()
+    with th.no_grad():
+        model.policy.action_net.bias.copy_(th.tensor([1 - p, p]).log())
     pq = p * (1 - p)
     exact = [(4 * pq * (13 * p + 29 * (1 - p)) - 16 * pq**2) / 20, 16 * pq * (2 - 4 * pq) / 20, 16 * pq / 20]
     rollout = sample(model, 10_000)
@@ -76,6 +81,9 @@ axes[1].legend(frameon=False)
 plt.show()
 
 # %% [markdown]
+# At $p = 0.5$ mean and optimal coincide at 0.20, against 1.00 without a baseline. At $p = 0.8$ the optimal constant
+# leaves 0.13, the mean 0.17 and no baseline 0.50.
+#
 # ## CartPole
 #
 # Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
@@ -96,11 +104,11 @@ plt.show()
 
 # %% [markdown]
 # "optimal" is only the best *constant*; "time_mean" and "leave_one_out" depend on the step, "value" on the state. Which
-# is best depends on the task. Here the constant leaves less noise than "leave_one_out", and with most other seeds also
-# less than "value". Hollow markers are biased, or may be. "time_mean" contains the return that it is subtracted from.
-# For $N$ episodes of one length its gradient is the one of "leave_one_out" times $(N - 1) / N$, signal and noise alike.
-# The floor takes the best constant for each single component of the gradient. No constant goes below it, but a baseline
-# that depends on the step or the state can.
+# is best depends on the task. Here the constant leaves less noise than "leave_one_out". Whether it also leaves less
+# than "value" depends on the seed. Hollow markers are biased, or may be. "time_mean" contains the return that it is
+# subtracted from. For $N$ episodes of one length its gradient is the one of "leave_one_out" times $(N - 1) / N$, signal
+# and noise alike. The floor takes the best constant for each single component of the gradient. No constant goes below
+# it, but a baseline that depends on the step or the state can.
 
 # %%
 ratio = {row.baseline: row.ratio.value for row in table}

@@ -2,10 +2,10 @@
 # # How far should a critic be trusted?
 #
 # A critic $V(s)$ can do more than serve as a baseline: it can stand in for the rewards that are still to come. With
-# $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$ the generalized advantage estimate is $\sum_k (\gamma \lambda)^k
-# \delta_{t+k}$ (Schulman et al., 2016). At $\lambda = 1$ it is the return less the baseline: unbiased, however wrong
-# $V$ is, where no time limit cuts the episode. At $\lambda = 0$ only $\delta_t$ is left: little noise, and all errors
-# of $V$.
+# $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$ the generalized advantage estimate is
+# $\sum_k (\gamma \lambda)^k \delta_{t+k}$ (Schulman et al., 2016). At $\lambda = 1$ it is $G_t - V(s_t)$. A wrong $V$
+# then changes the variance, but not the expectation, where no time limit cuts the episode and $V$ is 0 after the last
+# state. At $\lambda = 0$ only $\delta_t$ is left: little noise, and all errors of $V$.
 
 # %%
 import matplotlib.pyplot as plt
@@ -72,11 +72,12 @@ figure.suptitle("CartPole-v1, one policy, gradients of 300 episodes for each cri
 plt.show()
 
 # %% [markdown]
-# An untrained critic knows nothing of the future: at $\lambda = 0$ every weight is almost the same, and neither signal
-# nor noise is left. A trained one keeps most of the gradient, with less noise than at $\lambda = 1$. The usual
-# $\lambda = 0.95$ then has less noise too, and a bias that 300 episodes hardly show (0.00: none is detected). At
-# $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its errors. Lower $\lambda$
-# as long as bias and noise together fall: here some $\lambda$ below 1 is best.
+# An untrained critic knows nothing of the future: at $\lambda = 0$ every weight is about 1. Scores have mean zero, so
+# hardly any signal is left, and little noise. A trained one keeps most of the gradient, with less noise than at
+# $\lambda = 1$. The usual $\lambda = 0.95$ then has less noise too, and a bias that 300 episodes hardly show (0.00:
+# none is detected). At $\lambda = 1$ a wrong critic is only a bad baseline; at $\lambda = 0$ the policy follows its
+# errors. Lower $\lambda$ as long as bias and noise together fall: here some $\lambda$ below 1 is best. The noise is for
+# updates of 16 episodes. Larger batches have less noise but the same bias, so they need a larger $\lambda$.
 
 # %%
 (bias_before, noise_before), (bias_after, noise_after) = found.values()

@@ -49,9 +49,9 @@ assert check.passed
 # one of the two at random in a forward one. The error that curvature adds to a forward difference therefore cancels in
 # the mean, but is noise in each estimate. A regression would use both signs and solve the equation of the central
 # difference, so it is left out. The perturbations are large, since the noise of single episodes drowns smaller
-# differences. The cosine is between the *expected* estimate and the gradient. The signal-to-noise ratio is divided by
-# the steps. Perturbed policies that share a start wait for the longest episode of their round, and these steps count:
-# with one environment the differences need fewer.
+# differences. The cosine is between the *expected* estimate and the likelihood-ratio gradient of 400 other episodes.
+# The signal-to-noise ratio is divided by the steps. Perturbed policies that share a start wait for the longest episode
+# of their round, and these steps count: with one environment the differences need fewer.
 
 # %%
 estimators = ("likelihood_ratio", "forward", "central")
@@ -71,7 +71,9 @@ assert table["forward"].snr_per_step.high < table["central"].snr_per_step.low
 # angle to it. A single estimate is one draw, so eight of each are drawn. The angle of a fan is the noise within the
 # plane; the printed cosines count all ten parameters. The fans have 10, 20 and 200 episodes for an estimate. The
 # regression changes each parameter with a standard deviation of 0.3. The picture reaches to eight times $\|\theta\|$ on
-# each side, since the policy is new and $\theta$ small.
+# each side, since the policy is new and $\theta$ small. Ten times as many perturbations raise the regression's mean
+# cosine and narrow its fan. The plane contains the gradient, so fans look closer to it than they are in all ten
+# dimensions.
 
 
 # %%

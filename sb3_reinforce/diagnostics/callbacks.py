@@ -37,7 +37,8 @@ class GradientQualityCallback(Diagnosis):
 
     - ``gradient/snr``: ``N ‖E g‖² / tr Σ``, the signal-to-noise ratio of this rollout's gradient, with the weights of
       training;
-    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, the number of episodes with a signal-to-noise ratio of 1;
+    - ``gradient/noise_scale``: ``tr Σ / ‖E g‖²``, the number of episodes whose mean gradient has a
+      signal-to-noise ratio of 1;
     - ``gradient/variance/<baseline>``: tr Σ of one episode for each of ``baselines``, computed from these episodes;
     - ``gradient/cosine``: the cosine between the last two updates of the policy's parameters.
 

@@ -5,6 +5,8 @@ A baseline takes a ``Rollout`` and returns b_t of shape ``(n_steps, n_envs)``. I
 b_t does not depend on the action at t or on its consequences (Greensmith, Bartlett and Baxter, 2004). A user's own
 function is a baseline too.
 
+Statements about bias are for whole episodes, and with a critic for episodes that no time limit cuts.
+
 "Other episodes" are the others of the same group: of the rollout, or with ``episodes_per_start`` of the same start.
 ``mean`` always takes all.
 """

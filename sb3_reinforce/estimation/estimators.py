@@ -24,7 +24,8 @@ Estimator: TypeAlias = Callable[[Utility, th.Tensor, th.Tensor], th.Tensor]
 
 def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
     """
-    ``Δ ĝ ≈ U(θ + Δ) − U(θ)``: k + 1 evaluations, exact on linear utilities, error of order 1 in ‖Δ‖.
+    ``Δ ĝ ≈ U(θ + Δ) − U(θ)``: k + 1 evaluations, error of order 1 in ‖Δ‖; exact on linear utilities if
+    the perturbations span all dimensions.
 
     :param utility: U
     :param theta: θ, shape ``(n,)``
@@ -42,7 +43,8 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
 
 def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_top: int | None = None) -> th.Tensor:
     """
-    ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, exact on quadratic utilities, error of order 2 in ‖Δ‖.
+    ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, error of order 2 in ‖Δ‖; exact on quadratic utilities
+    if the perturbations span all dimensions.
 
     :param utility: U
     :param theta: θ, shape ``(n,)``
@@ -64,7 +66,8 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
 
 def regression_gradient(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
     """
-    ``[1 Δ] [u₀ ĝ]ᵀ ≈ U(θ + Δ)``: k evaluations, exact on linear utilities, error of order 1 in ‖Δ‖.
+    ``[1 Δ] [u₀ ĝ]ᵀ ≈ U(θ + Δ)``: k evaluations, error of order 1 in ‖Δ‖; exact on linear utilities if Δ − Δ̄
+    spans all dimensions.
 
     The intercept u₀ is fitted by centering: ``(Δ − Δ̄) ĝ ≈ U − Ū`` has the same ĝ (Frisch and Waugh, 1933). Where there
     are fewer perturbations than unknowns, this is the ĝ of least norm, and the level u₀ is not pulled towards zero.
