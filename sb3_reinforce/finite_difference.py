@@ -191,6 +191,8 @@ class FiniteDifference(BasePolicyGradient):
     def _check_arguments(self) -> None:
         """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
         check_finite_difference(self)
+        if self.env is not None:
+            check_scale(self.env)
         # Also where n_delta is given: an error if there is nothing to search
         n_parameters = self.n_parameters
         if self.n_delta is None:
@@ -300,7 +302,6 @@ class FiniteDifference(BasePolicyGradient):
                 estimator = partial(central_difference, n_top=self.n_top)
             first_seed = int(th.randint(2**31, (), generator=generator))
             self.policy.set_training_mode(False)
-            check_scale(self.env)
             with frozen(self.env) as observed:
                 utility = EpisodicUtility(self, searched, callback, observed, first_seed)
                 try:

@@ -108,8 +108,9 @@ class RecurrentREINFORCE(REINFORCE):
     def _setup_model(self) -> None:
         fitting = MultiInputLstmPolicy if isinstance(self.observation_space, spaces.Dict) else MlpLstmPolicy
         if self.policy_class in (MlpLstmPolicy, MultiInputLstmPolicy) and self.policy_class is not fitting:
+            for_masks = " (MaskedLstmPolicy for action masks)" if fitting is MultiInputLstmPolicy else ""
             raise ValueError(
-                f"policy must be {fitting.__name__} for observations in {self.observation_space}, got "
+                f"policy must be {fitting.__name__}{for_masks} for observations in {self.observation_space}, got "
                 f"{self.policy_class.__name__}"
             )
         super()._setup_model()

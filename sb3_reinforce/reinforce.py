@@ -556,8 +556,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        if not th.is_grad_enabled():
-            raise ValueError("learn needs gradients, and PyTorch's are turned off: call th.set_grad_enabled(True)")
+        if not th.is_grad_enabled() or th.is_inference_mode_enabled():
+            raise ValueError(
+                "learn needs gradients, and PyTorch's are turned off: leave the block of th.no_grad or "
+                "th.inference_mode, or call th.set_grad_enabled(True)"
+            )
         # Before the counters are reset
         check_reinforce(self)
         check_starts(self)

@@ -170,6 +170,9 @@ def main() -> None:
     arguments = parser.parse_args()
     matplotlib.use("agg")
     results = pd.concat(pd.read_csv(path) for path in arguments.results)
+    runs = results.loc[results["evaluation"] == "final", ["task", "algorithm", "seed", "budget"]]
+    if runs.duplicated().any():
+        parser.error(f"results have a run twice: {runs[runs.duplicated()].iloc[0].to_dict()}")
     order = [*LABELS, *sorted(set(results["algorithm"]) - LABELS.keys())]
     results = results.sort_values(
         ["task", "budget", "algorithm"],

@@ -1,6 +1,7 @@
 """Checks of what a user passes in: each error names the argument, its value and what is allowed."""
 
 import difflib
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -45,6 +46,8 @@ def check_number(name: str, value: Any, low: float, high: float = MAX, above: bo
         bracket = "(" if above else "["
         sign = ">" if above else ">="
         allowed = f"in {bracket}{low:g}, {high:g}]" if high < MAX else f"finite and {sign} {low:g}"
+        if high == math.inf:
+            allowed = f"{sign} {low:g}, and inf for no bound"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 
@@ -116,7 +119,13 @@ class CheckedSchedule(FloatSchedule):
             self(progress_remaining)
 
     def __call__(self, progress_remaining: float) -> float:
-        value: Any = self.value_schedule(progress_remaining)
+        try:
+            value: Any = self.value_schedule(progress_remaining)
+        except Exception as error:
+            raise ValueError(
+                f"{self.name} must be a number or a function of the remaining progress, and {self.given!r} called with "
+                f"{progress_remaining:g} raised {error!r}"
+            ) from error
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
         if isinstance(value, float) and -SCHEDULE_ROUNDING < value < 0:
             # A LinearSchedule that ends at 0 may end below it by rounding

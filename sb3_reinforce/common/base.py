@@ -15,7 +15,7 @@ from sb3_reinforce.common.arguments import Check, CheckedSchedule, check_device,
 from sb3_reinforce.common.distribution import Distributed
 from sb3_reinforce.common.processes import is_leader, rank_and_size
 from sb3_reinforce.common.settings import ATTRIBUTES, check_policy_name
-from sb3_reinforce.common.spaces import check_env, check_noise, shift_to_start
+from sb3_reinforce.common.spaces import check_dicts, check_env, check_noise, shift_to_start
 
 Model = TypeVar("Model", bound="BasePolicyGradient")
 
@@ -53,6 +53,7 @@ class BasePolicyGradient(Distributed):
         if needs_env or env is not None:
             env = check_env(env, verbose)
             check_noise(kwargs.get("use_sde", False), env.action_space)
+            check_dicts(policy, env.observation_space)
         # A copy, which the user's later changes do not reach
         kwargs["policy_kwargs"] = dict(policy_kwargs or {})
         self._schedules: dict[str, CheckedSchedule] = {}
@@ -180,9 +181,8 @@ class BasePolicyGradient(Distributed):
         arguments = own_arguments(cls, BasePolicyGradient).keys() - ATTRIBUTES.keys()
         unknown = sorted(kwargs.keys() - arguments - saved.keys() - LOAD_ARGUMENTS)
         if unknown:
-            raise TypeError(
-                f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {', '.join(sorted(arguments))}"
-            )
+            allowed = ", ".join(sorted(arguments))
+            raise TypeError(f"load cannot replace {', '.join(unknown)}: a {cls.__name__} has {allowed}")
         if env is not None:
             env = check_env(env, verbose=0)
         n_envs = None if env is None else getattr(env, "num_envs", 1)

@@ -8,7 +8,7 @@ import torch as th
 
 from sb3_reinforce.common.tensors import to_vector
 
-REMEDY = "a lower learning_rate, a max_grad_norm or scaled rewards (VecNormalize)"
+REMEDY = "a lower learning rate or scaled rewards (VecNormalize)"
 
 
 def step(
@@ -57,7 +57,7 @@ def kept_finite(optimizer: th.optim.Optimizer, parameters: Sequence[th.nn.Parame
             optimizer.state.clear()
             raise ValueError(
                 f"The update of the {name} left a parameter that is not finite. The parameters are those before this "
-                "update, and the optimizer starts with an empty state; a lower learning_rate, other optimizer_kwargs "
+                "update, and the optimizer starts with an empty state; a lower learning rate, other optimizer_kwargs "
                 "or scaled rewards (VecNormalize) may help"
             )
 

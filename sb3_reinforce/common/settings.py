@@ -39,7 +39,7 @@ MAX_TEMPERATURE = 1e6
 MAX_STD = 1e6
 USE_RECURRENT = "a memory needs sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may be enough instead"
 USE_MASKED_POLICY = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
-RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
+RECURRENT = (*(f"{name}LstmPolicy" for name in ("Mlp", "Cnn", "MultiInput", "Masked")), "RecurrentActorCriticPolicy")
 CONTRIB_POLICIES = dict.fromkeys(RECURRENT, USE_RECURRENT) | {"MaskableActorCriticPolicy": USE_MASKED_POLICY}
 NO_CLIPPING = "it takes one policy step per rollout, bounded by max_grad_norm, or with step='natural' by target_kl"
 USE_POLICY_KWARGS = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
@@ -178,15 +178,15 @@ def check_reinforce(model: Any) -> None:
             model._choose("n_episodes", n_envs if shares_starts else max(16, n_envs))
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
-        raise ValueError(f"{given} are both given: a rollout has a length in steps or in episodes. Set one to None")
+        raise ValueError(f"{given} are both set: a rollout has a length in steps or in episodes. Set one to None")
     compares_episodes = model.baseline in ("time_mean", "leave_one_out", "optimal")
     # For episodes that share their start, check_starts says what is allowed
     if model.n_episodes == 1 and compares_episodes and not shares_starts:
         reason = f"baseline={model.baseline!r}, which compares episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
-        got = f"baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
-        raise ValueError(f"gae_lambda={model.gae_lambda} needs baseline='value' and reward_to_go=True, got {got}")
+        got = f"gae_lambda={model.gae_lambda}, baseline={model.baseline!r} and reward_to_go={model.reward_to_go!r}"
+        raise ValueError(f"gae_lambda must be 1 unless baseline='value' and reward_to_go=True, got {got}")
     if model.target_kl is not None and model.step != "natural":
         got = f"target_kl={model.target_kl!r} and step={model.step!r}"
         reason = "it bounds the natural step. PPO's target_kl ends epochs, and there are none here"
@@ -242,7 +242,7 @@ def check_learn(env: Any, *arguments: Any) -> None:
         raise ValueError("env is None, and learning needs an environment: pass one to load, or call set_env")
     default = th.get_default_device()
     if default.type != "cpu":
-        reset = "call th.set_default_device('cpu'), and give the model device=... instead"
+        reset = "leave the block of th.device, or call th.set_default_device('cpu'); give the model device=... instead"
         raise ValueError(f"PyTorch's default device must be the CPU, got {default}: {reset}")
     for (name, check), value in zip(LEARN_ARGUMENTS.items(), arguments, strict=True):
         check(name, value)

@@ -46,11 +46,19 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"observation_space must not be empty, got {observation_space}")
     for key, space in parts.items():
         name = f"observation_space[{key!r}]" if key else "observation_space"
-        check_space(name, space, "Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these")
+        dict_of = "" if key else ", or a Dict of these"
+        check_space(name, space, f"Box, Discrete, MultiDiscrete or MultiBinary{dict_of}")
         if isinstance(space, spaces.Box) and not space.shape:
             raise ValueError(f"{name} must have a dimension, got {space}: make its shape (1,)")
         if np.any(getattr(space, "start", 0)):
             raise ValueError(f"{name} must start at 0, got {space}: subtract its start")
+
+
+def check_dicts(policy: str | type, space: spaces.Space[Any]) -> None:
+    """Name the policies for observations in dicts, of which Stable-Baselines3 knows one, which enforces no masks."""
+    if isinstance(space, spaces.Dict) and policy in ("MlpPolicy", "CnnPolicy"):
+        allowed = "MultiInputPolicy, or MaskedPolicy for action masks,"
+        raise ValueError(f"policy must be {allowed} for observations in {space}, got {policy}")
 
 
 def check_space(name: str, space: spaces.Space[Any], supported: str) -> None:

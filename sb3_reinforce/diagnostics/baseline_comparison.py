@@ -105,7 +105,7 @@ def functions_of(baselines: Any) -> dict[str, Baseline]:
     is_single = isinstance(baselines, str) or not isinstance(baselines, Iterable)
     for baseline in [baselines] if is_single else baselines:
         function = check_function("baselines", baseline, BASELINES)
-        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", repr(baseline))
+        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", type(baseline).__name__)
         if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(
                 f"baselines must have names that differ from each other and from 'floor', and {name!r} is taken: set "

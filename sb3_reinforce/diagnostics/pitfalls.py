@@ -126,7 +126,7 @@ def unscaled_returns(history: History) -> str | None:
     what, remedy = ("critic's gradient", "") if is_natural else ("gradient", ", or set normalize_advantage=True")
     return (
         f"The returns have a root mean square of {scale:.3g}, and the {what} has their scale. Wrap the environment in "
-        f"VecNormalize{remedy}"
+        f"VecNormalize with norm_reward=True{remedy}"
     )
 
 
@@ -148,6 +148,8 @@ def too_few_episodes(history: History) -> str | None:
     ratio = float(signal_to_noise(compute_moments(gram(th.stack(gradients)))))
     if ratio < 0.1 or math.isnan(ratio):
         argument = "n_episodes" if history.model.n_steps is None else "n_steps, or the number of environments"
+        if history.model.episodes_per_start > 1:
+            argument = "the number of environments"
         shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "

@@ -45,8 +45,8 @@ def cannot_seed(base: Any) -> ValueError:
     """The error for environments that cannot be reset with a seed each."""
     return ValueError(
         "Episodes can start from given seeds only where env_method('reset', seed=...) works, and "
-        f"{type(base).__name__} does not support it here: use another VecEnv, or set common_random_numbers=False "
-        "(FiniteDifference) or episodes_per_start=1 (REINFORCE)"
+        f"{type(base).__name__} does not support it here: use DummyVecEnv or SubprocVecEnv. Training needs no given "
+        "seeds with common_random_numbers=False (FiniteDifference) and episodes_per_start=1 (REINFORCE)"
     )
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs
 
-from sb3_reinforce.envs.checks import BadData, as_reward, check_observation
+from sb3_reinforce.envs.checks import BadData, as_reset, as_reward, check_observation
 
 IMMUTABLE = (bool, int, float, str, np.generic, NoneType)
 
@@ -42,7 +42,7 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             check_observation(env.observation_space, obs, i)
             # An environment may write its next observation into the same array
             info["terminal_observation"] = deepcopy(obs)
-            obs, env.reset_infos[i] = single.reset()
+            obs, env.reset_infos[i] = as_reset(single.reset(), i)
         if is_box and type(obs) is np.ndarray and (obs.dtype, obs.shape) == form:
             rows[i] = obs
         else:
@@ -56,7 +56,7 @@ def reset(env: DummyVecEnv) -> VecEnvObs:
     """What ``env.reset()`` returns."""
     for i, single in enumerate(env.envs):
         options = {"options": env._options[i]} if env._options[i] else {}
-        obs, env.reset_infos[i] = single.reset(seed=env._seeds[i], **options)
+        obs, env.reset_infos[i] = as_reset(single.reset(seed=env._seeds[i], **options), i)
         write_observation(env, i, obs)
     env._reset_seeds()
     env._reset_options()

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 
 import torch as th
 
+from sb3_reinforce.common.arguments import check_integer
 from sb3_reinforce.common.tensors import ROUNDING
 
 Utility: TypeAlias = Callable[[th.Tensor], th.Tensor]
@@ -52,12 +53,14 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,
         section 3.3), which biases ĝ towards them; None for all
     :return: ĝ, shape ``(n,)``
-    :raises TypeError: If Δ is not a tensor, or θ not a tensor of floats
-    :raises ValueError: If Δ does not fit θ, all perturbations are zero, or the utility does not return a finite number
-        for each candidate
+    :raises TypeError: If Δ is not a tensor, θ not a tensor of floats, or ``n_top`` not an integer
+    :raises ValueError: If Δ does not fit θ, all perturbations are zero, ``n_top`` is not from 1 to k, or the utility
+        does not return a finite number for each candidate
     """
     deltas = check_deltas(theta, deltas)
     check_design(deltas, deltas)
+    if n_top is not None:
+        check_integer("n_top", n_top, 1, len(deltas))
     utilities = evaluate_utility(utility, th.stack([theta + deltas, theta - deltas]))
     top = utilities.amax(0).argsort(descending=True, stable=True)[:n_top]
     plus, minus = utilities[:, top]

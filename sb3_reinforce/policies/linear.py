@@ -34,7 +34,8 @@ class LinearPolicy(ActorCriticPolicy):
             raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={kwargs['net_arch']!r}: use MlpPolicy")
         if isinstance(observation_space, spaces.Dict) and "features_extractor_class" not in kwargs:
             raise ValueError(
-                f"LinearPolicy needs observations in one array, got {observation_space}: use MultiInputPolicy"
+                f"LinearPolicy needs observations in one array, got {observation_space}: use MultiInputPolicy, "
+                "or MaskedPolicy for action masks"
             )
         super().__init__(observation_space, action_space, lr_schedule, **{**kwargs, "net_arch": []})
         th.nn.init.zeros_(cast(th.Tensor, self.action_net.bias)).requires_grad_(False)

@@ -76,7 +76,8 @@ def natural_step(
             "The natural step is left out, and the parameters are unchanged: no step with a KL divergence of about "
             f"target_kl={target_kl:.2g} was found. Usually the policy is almost deterministic: raise ent_coef, and "
             "temperature (discrete actions) or min_std (Box actions)",
-            stacklevel=2,
+            # The decorator is a level
+            stacklevel=3,
         )
         return norm, 0.0
     return norm, kl

@@ -124,7 +124,7 @@ def evaluate_candidates(
                 actor.assign(started, thetas[[tracker.pairs[i][0] for i in started]])
                 started = []
             actions = actor.act(obs)
-            check_finite("The action", actions, (None,))
+            check_finite("The policy's action", actions, (None,))
             obs, rewards, dones, infos = env.step(actions)
             tracker.add(rewards if original is None else original(), obs)
             # Some VecEnvs give numbers
@@ -145,7 +145,7 @@ def compare_with_earlier(met: dict[int, Any], seeds: np.ndarray, obs: Any) -> No
             warnings.warn(
                 "Common random numbers do not reduce the noise here: environments reset with the same seed, and then "
                 "once more without a seed, return different observations. Let the environment draw all random numbers "
-                "from self.np_random, or give FiniteDifference common_random_numbers=False",
+                "from self.np_random, or train FiniteDifference with common_random_numbers=False",
                 stacklevel=3,
             )
             return

@@ -104,14 +104,14 @@ def collect(
         actions, values, log_probs = actor.act(model._last_obs)
         write_step(rollout_buffer, n_steps, model._last_obs, actions, values, log_probs)
         # The environment would be blamed for what it does with NaN
-        check_finite("The action", actions, (None,))
+        check_finite("The policy's action", actions, (None,))
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
         try:
             if is_attached:
                 callback.update_locals(locals())
-                if not callback.on_step():
+                if not goes_on(callback):
                     return None
         finally:
             # As with A2C, the callback finds s_t here. If it fails, s_{t+1} is kept
@@ -144,6 +144,14 @@ def collect(
     if is_attached:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, has_values
+
+
+def goes_on(callback: BaseCallback) -> bool:
+    """Call a callback at a step; None stops training as False does, usually by mistake."""
+    answer: bool | None = callback.on_step()
+    if answer is None:
+        warnings.warn("callback returned None, which stops training: return True to go on", stacklevel=3)
+    return bool(answer)
 
 
 def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[Any]) -> None:

@@ -64,9 +64,9 @@ def original_reward_of(env: VecEnv) -> tuple[Callable[[], np.ndarray] | None, Ve
     return found, env
 
 
-def check_scale(env: VecEnv | None) -> None:
+def check_scale(env: VecEnv) -> None:
     """Refuse a VecNormalize whose scale of the rewards is used, but would never be learned."""
-    original, changing = original_reward_of(cast(VecEnv, env))
+    original, changing = original_reward_of(env)
     if original is None and any(each.training and each.norm_reward for each in normalizers(env)):
         raise ValueError(
             f"{type(changing).__name__} lies above VecNormalize and may change rewards. FiniteDifference compares "

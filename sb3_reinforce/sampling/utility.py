@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, columns_of, evaluate_candidates, seeds_of
+from sb3_reinforce.sampling.collection import goes_on
 from sb3_reinforce.sampling.normalization import ObservationStatistics
 
 
@@ -81,7 +82,7 @@ class EpisodicUtility:
             each.update()
             each.thaw()
         try:
-            go_on = self.callback.on_step()
+            go_on = goes_on(self.callback)
         finally:
             for each in self.observed:
                 each.freeze()

@@ -102,6 +102,10 @@ class Experiment(exp_manager.ExperimentManager):
         if self.continue_training and (fixed := {"policy", "policy_kwargs"} & replaced.keys()):
             raise ConfigurationError(f"--trained-agent keeps the model's policy: leave out -params {min(fixed)}")
         found.update(replaced)
+        for key in ("env_kwargs", "vec_env_wrapper"):
+            # enjoy fails where a key is there without a value
+            if found.get(key, key) is None:
+                del found[key]
         if "env_kwargs" in found and self.env_kwargs:
             found["env_kwargs"] = self.env_kwargs
         check_hyperparams(self.algo, found)
@@ -140,7 +144,10 @@ def find_settings(experiment: Experiment) -> Settings:
     if experiment.model_config is not None:
         print(f"Continuing with the settings of the model: {experiment.model_config}")
         # The Zoo writes an OrderedDict, which safe_load refuses
-        return dict(yaml.unsafe_load(experiment.model_config.read_text(encoding="utf-8")))
+        own = dict(yaml.unsafe_load(experiment.model_config.read_text(encoding="utf-8")))
+        # The model keeps its window, which load cannot replace
+        own.pop("stats_window_size", None)
+        return own
     config, env_id = experiment.config, experiment.env_name.gym_id
     print(f"Loading hyperparameters from: {config}")
     published = as_dict(f"The content of {config}", load_configuration(config))

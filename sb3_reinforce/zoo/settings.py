@@ -130,11 +130,12 @@ def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
 
 
 def as_dict(key: str, value: Any) -> Settings:
-    """A setting as a dict: the Zoo evaluates a text as Python, with the names of the module `exp_manager`."""
+    """A setting as a dict: the Zoo evaluates a text as Python, with the names of one of its modules."""
     result = {} if value is None or (key == "normalize" and isinstance(value, bool)) else value
     if isinstance(value, str) and key in PYTHON_KEYS:
         try:
-            result = eval(value, dict(vars(exp_manager)))
+            # The Zoo reads normalize once more, in the module utils
+            result = eval(value, dict(vars(utils if key == "normalize" else exp_manager)))
         except Exception as error:
             raise ConfigurationError(f"{key} must be Python, but {value!r} raises {error!r}") from error
     if not isinstance(result, dict):

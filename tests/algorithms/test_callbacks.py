@@ -76,6 +76,14 @@ def test_a_callback_stops_training_at_the_very_step(kind):
     assert model.num_timesteps >= 62
 
 
+@all_kinds
+def test_a_callback_that_forgets_to_return_true_is_named(kind):
+    model = make(kind, Corridor())
+    with pytest.warns(UserWarning, match="callback returned None, which stops training: return True to go on"):
+        model.learn(64, lambda *_: None)
+    assert model.num_timesteps == 1
+
+
 def test_at_the_end_of_a_rollout_a_callback_finds_the_dones_of_its_last_step():
     ends = Record(lambda model: ends.locals["dones"].tolist())
     make("steps", make_vec_env(lambda: Corridor((4,)), 2)).learn(32, ends)

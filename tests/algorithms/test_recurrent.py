@@ -271,6 +271,7 @@ def test_the_log_has_the_name_of_the_class_or_the_given_one(algorithm, policy, t
 
     def keep_name(locals_, globals_):
         given.append(locals_["tb_log_name"])
+        return False
 
     for each, kwargs in ((algorithm, {}), (own, {}), (own, {"tb_log_name": "mine"})):
         each(policy, "CartPole-v1", tensorboard_log=tmp_path, device="cpu").learn(1, keep_name, **kwargs)

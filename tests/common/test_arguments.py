@@ -11,12 +11,13 @@ import pytest
 import torch as th
 from callbacks import Record
 from models import KINDS, both, both_extents, make, plain
+from sb3_contrib.common.envs import InvalidActionEnvDiscrete
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_reinforce import REINFORCE, FiniteDifference
+from sb3_reinforce import REINFORCE, ActionMaskObservation, FiniteDifference
 from sb3_reinforce.common import arguments
 from sb3_reinforce.common.settings import LEARN_ARGUMENTS
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
@@ -144,6 +145,7 @@ def test_a_wrong_argument_of_learn_is_named_and_changes_nothing(kind, name):
     assert model._last_obs is None and model.num_timesteps == 0
 
 
+WITH_MASKS = ActionMaskObservation(InvalidActionEnvDiscrete(8))
 RECURRENT, MASKABLE = (
     type(name, (ActorCriticPolicy,), {"__doc__": "Has the name of sb3-contrib's."})
     for name in ("RecurrentActorCriticPolicy", "MaskableActorCriticPolicy")
@@ -164,7 +166,10 @@ RECURRENT, MASKABLE = (
         ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
         ("steps", {"policy": "MlpLstmPolicy"}, ["policy", "MlpLstmPolicy", "RecurrentREINFORCE", "VecFrameStack"]),
         ("search", {"policy": RECURRENT}, ["policy", "RecurrentREINFORCE", "VecFrameStack"]),
+        ("steps", {"policy": "MaskedLstmPolicy"}, ["policy", "MaskedLstmPolicy", "RecurrentREINFORCE"]),
         ("steps", {"policy": MASKABLE}, ["policy", "MaskedPolicy", "ActionMaskObservation"]),
+        ("search", {"env": WITH_MASKS, "policy": "MlpPolicy"}, ["got MlpPolicy", "MaskedPolicy"]),
+        ("steps", {"learning_rate": lambda: 1e-3}, ["learning_rate", "remaining progress", "TypeError"]),
         ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
         ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
@@ -247,6 +252,7 @@ def test_the_search_recommends_the_cpu(policy):
         (partial(arguments.check_number, low=0), -1, "finite and >= 0"),
         (partial(arguments.check_number, low=0, above=True), 0, "finite and > 0"),
         (partial(arguments.check_number, low=0, high=1), 2, r"in \[0, 1\]"),
+        (partial(arguments.check_number, low=0, high=np.inf, above=True), 0, "> 0, and inf for no bound"),
         (partial(arguments.CheckedSchedule, high=1, above=True), 0.0, r"in \(0, 1\]"),
         (partial(arguments.check_integer, low=2), 1, "at least 2"),
         (partial(arguments.check_integer, low=2, high=5), 6, "at least 2 and at most 5"),
@@ -279,8 +285,9 @@ def test_integers_of_numpy(kind, tmp_path):
 
 
 @both_extents
-def test_without_gradients_nothing_is_learned_in_silence(kind):
+@pytest.mark.parametrize("block", [th.no_grad, th.inference_mode])
+def test_without_gradients_nothing_is_learned_in_silence(kind, block):
     model = make(kind)
-    with th.no_grad(), pytest.raises(ValueError, match="gradients"):
+    with block(), th.set_grad_enabled(block is th.inference_mode), pytest.raises(ValueError, match="gradients"):
         model.learn(16)
     assert model.num_timesteps == 0

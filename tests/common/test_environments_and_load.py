@@ -177,7 +177,7 @@ def test_what_the_user_has_left_open_is_chosen_again_at_load(tmp_path):
     make("episodes", make_vec_env("CartPole-v1", 2), n_episodes=None).save(tmp_path / "model")
     assert (loaded(2).n_episodes, loaded(20).n_episodes) == (16, 20)
     make("steps", n_steps=32).save(tmp_path / "model")
-    with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both given"):
+    with pytest.raises(ValueError, match="n_steps=32 and n_episodes=4 are both set"):
         loaded(1, n_episodes=4)
     search = make("search", n_delta=None)
     search.save(tmp_path / "model")

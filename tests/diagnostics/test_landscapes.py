@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from enumeration import make_model, true_gradient
-from environments import Corridor, Scales, Tree
+from environments import Corridor, Scales, Tree, Wrapper
 from gymnasium import spaces
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
@@ -363,15 +363,19 @@ def test_a_measurement_before_a_rollout_leaves_the_noise_of_gsde():
     th.testing.assert_close(*ends)
 
 
-def test_the_likelihood_ratio_is_of_rewards_that_are_not_clipped():
-    """As the utilities of finite differences are; the scale of a new VecNormalize is 1."""
+def test_gradients_and_utilities_are_of_rewards_that_are_not_clipped():
+    """Also where a wrapper above VecNormalize may change rewards; the scale of a new VecNormalize is 1."""
     gradients = []
+    utilities = []
     for bound in (0.5, 10.0):
         env = VecNormalize(make_vec_env(lambda: Corridor((2,), lambda t, action: 3.0 * action), 2, seed=0))
         env.clip_reward = bound
-        model = REINFORCE("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+        model = REINFORCE("MlpPolicy", Wrapper(env), policy_kwargs={"net_arch": []}, device="cpu", seed=0)
         th.manual_seed(0)
         gradients.append(likelihood_ratio(model, 50)[0])
+        utility = CandidateUtility(model, 50, seed=0)
+        utilities.append(utility(utility.theta[None]))
         assert env.clip_reward == bound
-    assert gradients[0].any()
+    assert gradients[0].any() and utilities[0].any()
     th.testing.assert_close(*gradients)
+    th.testing.assert_close(*utilities)

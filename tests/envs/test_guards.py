@@ -159,7 +159,10 @@ def test_a_search_finds_actions_that_are_not_finite():
     env = Huge(make_vec_env("Pendulum-v1", 2))
     kwargs = {"estimator": "central", "delta_std": 1.0, "policy_kwargs": {"activation_fn": th.nn.ReLU}}
     model = FiniteDifference("MlpPolicy", env, seed=0, device="cpu", **kwargs)
-    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(ValueError, match="The action of environment"):
+    with (
+        np.errstate(over="ignore", invalid="ignore"),
+        pytest.raises(ValueError, match="The policy's action of environment"),
+    ):
         model.learn(800)
 
 

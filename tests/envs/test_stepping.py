@@ -94,6 +94,19 @@ class Silent(Drawn):
         return *super().step(action)[:4], None
 
 
+class OldReset(Drawn):
+    """Returns the observation alone, as in OpenAI Gym."""
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0]
+
+
+def test_a_reset_without_an_info_is_named():
+    model = make_model("steps", DummyVecEnv([lambda: Drawn("box"), lambda: OldReset("box")]))
+    with pytest.raises(ValueError, match=r"reset of environment 1 must return \(observation, info\), got"):
+        model.learn(8)
+
+
 def test_an_info_that_is_not_a_dict_is_named():
     model = make_model("steps", DummyVecEnv([lambda: Drawn("box"), lambda: Silent("box")]))
     with pytest.raises(ValueError, match=r"The info of environment 1 must be a dict, got None \(num_timesteps=0\)"):

@@ -1,5 +1,7 @@
 """Estimators: exact where they say so, of the order that they say, and one identity between two of them."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 import torch as th
@@ -97,6 +99,14 @@ def test_n_top_is_the_central_difference_of_the_best_perturbations():
     for n_top, rows in ((2, deltas[best]), (6, deltas)):
         estimate = central_difference(exponential, theta, deltas, n_top=n_top)
         th.testing.assert_close(estimate, central_difference(exponential, theta, rows))
+
+
+@pytest.mark.parametrize("n_top", [0, -1, 7, 2.5])
+def test_n_top_is_a_number_of_perturbations(n_top):
+    evaluate = Mock()
+    with pytest.raises((ValueError, TypeError), match="n_top must be"):
+        central_difference(evaluate, th.zeros(N).double(), normal(6, N, seed=0), n_top=n_top)
+    evaluate.assert_not_called()
 
 
 def test_n_top_ranks_a_pair_by_its_better_utility():

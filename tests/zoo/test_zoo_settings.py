@@ -117,6 +117,18 @@ def test_a_model_goes_on_with_its_own_settings(name, tmp_path):
     assert config_of(tmp_path / name / "CartPole-v1_2") == config_of(tmp_path / name / RUN) | {"learning_rate": 0.0}
 
 
+def test_settings_that_the_zoos_own_commands_cannot_read_are_left_out(tmp_path, capsys):
+    common = ("-f", str(tmp_path), "-n", "64")
+    params = ("stats_window_size:50", "env_kwargs:None", "vec_env_wrapper:None")
+    train("reinforce", *common, "--eval-freq", "-1", "-params", *params)
+    train("reinforce", *common, "--eval-freq", "-1", "-i", str(tmp_path / "reinforce" / RUN / "CartPole-v1.zip"))
+    assert load(tmp_path / "reinforce" / "CartPole-v1_2")._stats_window_size == 50
+    zoo("enjoy", "--algo", "reinforce", "--env", "CartPole-v1", *common, "--no-render")
+    assert "Mean reward: " in capsys.readouterr().out
+    normalize = ("-params", "normalize:'dict(clip_obs=np.inf)'")
+    assert "normalize must be Python" in message_of(capsys, "train", "--algo", "reinforce", *common, *normalize)
+
+
 def test_a_conf_file_goes_before_the_settings_of_a_model(tmp_path):
     arguments = conf(tmp_path, **{"CartPole-v1": {"policy": "MlpPolicy", "n_timesteps": 64, "gamma": 0.5}})
     train("reinforce", "-n", "64", "--eval-freq", "-1", "-f", str(tmp_path))
