@@ -66,10 +66,10 @@ class FiniteDifference(BasePolicyGradient):
     searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward pass,
     other policies one after the other.
 
-    With VecNormalize, its statistics are frozen during an update, so that candidates are compared on one scale, and the
-    observations of its steps join them afterwards; the first update has the scale of the first observations. Utilities
-    are sums of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of
-    that wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
+    The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. Afterwards
+    its observations are added. The first update uses the statistics of the first reset. Utilities are sums of the
+    rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of that wrapper's
+    rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -78,7 +78,7 @@ class FiniteDifference(BasePolicyGradient):
     :param estimator: ``"regression"``, ``"central"``, ``"forward"``, or a function of a utility, θ of shape ``(n,)``
         and perturbations of shape ``(k, n)`` that returns a gradient of shape ``(n,)``
     :param perturbation: ``"gaussian"``, ``"sphere"``, ``"rademacher"``, ``"coordinate"``, or a function of k, n and a
-        ``torch.Generator`` that returns a tensor of shape ``(k, n)``
+        ``torch.Generator`` that returns a tensor of shape ``(k, n)``, which ``delta_std`` multiplies
     :param n_delta: k, the perturbations per update. None: ``min(2n, 64)`` up to n = 42 and ``min(n / 2, 64)``
         beyond, at least ``n_top``; differences along coordinates have ``min(n, 64)``. It is chosen at construction:
         set ``model.n_delta = None`` after layers are frozen
@@ -237,8 +237,11 @@ class FiniteDifference(BasePolicyGradient):
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises TypeError: If an argument is of the wrong type
-        :raises ValueError: If an argument is out of its range, a perturbation, reward, observation or gradient is not
-            finite, a design cannot be solved, or an episode does not end. The policy is the last good one
+        :raises ValueError: If an argument is out of its range, the model has no environment, PyTorch's default device
+            is not the CPU, processes under torchrun have different arguments, a perturbation, reward, observation,
+            action or gradient is not finite, all perturbations are zero (for ``"regression"``: equal), or an episode
+            does not end. The policy is the last good one
+        :raises ConnectionError: If a worker of a ``SubprocVecEnv`` dies
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -272,7 +275,8 @@ class FiniteDifference(BasePolicyGradient):
 
     def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate | None:
         """
-        Perturb θ, evaluate the candidates and estimate ∇U(θ). The policy stays as it is.
+        Perturb θ, evaluate the candidates and estimate ∇U(θ). θ does not change. The policy is left in evaluation mode.
+        The counts of steps and episodes, the statistics of VecNormalize and the generator of the perturbations go on.
 
         ``learn`` calls it. If you call it yourself, seed the environments again afterwards (``env.seed``): with common
         random numbers all have the seed of the last candidates.
@@ -333,7 +337,8 @@ class FiniteDifference(BasePolicyGradient):
         One optimizer step uphill.
 
         :param estimate: What ``estimate_gradient`` returned
-        :raises ValueError: If the step is not finite; the parameters are those before it
+        :raises ValueError: If the gradient or a parameter is not finite. The parameters are those before the step; a
+            non-finite parameter also clears the optimizer's state
         """
         gradient = estimate.gradient
         searched = estimate.parameters

@@ -47,10 +47,12 @@ class RecurrentREINFORCE(REINFORCE):
 
     ``policy_kwargs`` are the arguments of :class:`~sb3_reinforce.recurrent.MlpLstmPolicy`, such as ``memory="gru"``.
 
-    To predict, pass the returned state to the next call; without it each call starts an episode:
+    To predict, pass the returned state and the last ``dones`` to the next call. Without a state each call starts an
+    episode:
 
-        >>> state, episode_start = None, np.ones(1, dtype=bool)  # doctest: +SKIP
-        >>> action, state = model.predict(obs, state, episode_start)  # doctest: +SKIP
+        >>> obs, state, episode_start = env.reset(), None, None  # doctest: +SKIP
+        >>> actions, state = model.predict(obs, state, episode_start)  # doctest: +SKIP
+        >>> obs, rewards, episode_start, infos = env.step(actions)  # doctest: +SKIP
 
     :param policy: MlpLstmPolicy, CnnLstmPolicy, MultiInputLstmPolicy, MaskedLstmPolicy or a subclass of one of them
     :param env: The environment to learn from (if registered in Gymnasium, can be str)
@@ -61,7 +63,9 @@ class RecurrentREINFORCE(REINFORCE):
     :param batch_size: Steps per minibatch of the critic, at least one whole sequence
     :param kwargs: All other arguments of :class:`~sb3_reinforce.REINFORCE`
     :raises TypeError: If an argument is of the wrong type
-    :raises ValueError: If an argument is out of its range, or the policy has no memory
+    :raises ValueError: If an argument is out of its range, the policy has no memory, or a subclass of a policy
+        overrides ``forward``, ``evaluate_actions`` or ``get_distribution`` without ``sequence_distribution``, or
+        ``predict_values`` without ``sequence_values``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

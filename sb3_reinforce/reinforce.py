@@ -67,9 +67,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
     (Williams, 1992, section 5 and theorem 2, for the total return; Sutton et al., 2000, for G_t; γ^t only with
-    ``discount_scores``). m_t is 1 for the steps that are used: those whose return is known and, with ``n_episodes``, in
-    an episode of the quota. The denominator is ``n_steps * n_envs`` for fixed rollouts; for whole episodes see
-    ``normalize_by``. E[ĝ] is exactly ∇θ E[G_0] with ``n_episodes``, ``normalize_by="episodes"``,
+    ``discount_scores``). m_t is 1 for used steps and 0 for the others. Used steps have a known return and, with
+    ``n_episodes``, belong to an episode that counts. The denominator is ``n_steps * n_envs`` for fixed rollouts; for
+    whole episodes see ``normalize_by``. E[ĝ] is exactly ∇θ E[G_0] with ``n_episodes``, ``normalize_by="episodes"``,
     ``discount_scores=True``, ``ent_coef=0``, the baseline ``"none"``, ``"leave_one_out"`` or ``"optimal"``, and without
     ``normalize_advantage`` and clipping. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
     gradient where the noise depends on the features. So are dropout, batch normalization and noisy layers, with which
@@ -111,8 +111,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param reward_to_go: G_t is the sum of the discounted rewards from t on; if False, the total return G_0, which is
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
-    :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of steps used (a direction that is
-        biased where lengths differ), or ``"episodes"``, their number (unbiased)
+    :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of used steps (the direction is
+        biased where lengths differ), or ``"episodes"``, the number of episodes (unbiased)
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``
@@ -299,15 +299,16 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
         :param env: The model's environments
         :param callback: Called at each step, and at the beginning and end of the rollout
-        :param rollout_buffer: Filled as by A2C: ``advantages`` is G_t − b_t, and ``returns`` what the critic is fitted
-            to, or without a critic G_t; both are 0 at steps that are not used. ``rewards`` do not include γ V at time
-            limits
+        :param rollout_buffer: Filled as by A2C, but ``values`` can be 0 without a critic and ``log_probs`` without a
+            callback. ``advantages`` is G_t − b_t, and ``returns`` what the critic is fitted to, or without a critic
+            G_t; both are 0 at steps that are not used. ``rewards`` do not include γ V at time limits
         :param n_rollout_steps: Steps per environment, None for whole episodes
         :return: False if the callback stopped the collection; the rollout is then dropped
-        :raises TypeError: If an argument of the model has been changed to a wrong type
-        :raises ValueError: If one has been changed to a wrong value, if a reward, an observation or a baseline is not
-            finite, if no episode ended in a rollout that needs one, or if an episode does not end. The parameters have
-            not changed, and the environments are reset where they stopped in the middle of episodes
+        :raises TypeError: If an argument of the model has been changed to a wrong type, or a baseline returns no tensor
+        :raises ValueError: If an argument has been changed to a wrong value, a baseline returns a tensor of another
+            shape, a reward, an observation, an action or a baseline is not finite, no episode ended in a rollout that
+            needs one, or an episode does not end. The parameters have not changed. Environments that stopped in the
+            middle of episodes are reset before the next rollout
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
@@ -433,9 +434,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         One policy step along ĝ, then the critic's passes.
 
-        :raises ValueError: If there is no rollout, a gradient is not finite, a step makes a parameter that is not, or,
-            with the natural step, the policy's distribution does not give the log π that is trained. The parameters
-            are then those before that step, or before the critic's passes
+        :raises ValueError: If there is no rollout, a gradient or a parameter becomes non-finite, or, with the natural
+            step, ``get_distribution`` does not give the log π that is trained. A step with a non-finite gradient is not
+            taken. After a non-finite parameter the parameters are those before the policy's step or before the critic's
+            passes, and the optimizer's state is cleared. If the critic fails, the policy keeps its step
         """
         rollout = self.rollout
         if rollout is None:
@@ -550,16 +552,17 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises TypeError: If an argument is of the wrong type
-        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, PyTorch's gradients are
-            turned off, its default device is not the CPU, or processes under torchrun have different arguments; and as
-            in ``collect_rollouts`` and ``train``
+        :raises ValueError: If ``total_timesteps`` or ``log_interval`` is out of its range, the model has no
+            environment, PyTorch's gradients are turned off, its default device is not the CPU, or processes under
+            torchrun have different arguments; and as in ``collect_rollouts`` and ``train``
+        :raises ConnectionError: If a worker of a ``SubprocVecEnv`` dies
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         if not th.is_grad_enabled() or th.is_inference_mode_enabled():
             raise ValueError(
                 "learn needs gradients, and PyTorch's are turned off: leave the block of th.no_grad or "
-                "th.inference_mode, or call th.set_grad_enabled(True)"
+                "th.inference_mode, or undo th.set_grad_enabled(False)"
             )
         # Before the counters are reset
         check_reinforce(self)

@@ -139,7 +139,8 @@ class Faulty(Corridor):
     Episodes of seven steps; something goes wrong at step ``at`` of its life, or at reset ``at``.
 
     The fault is "reward", "observation" or "first observation", which are ``value`` then; "raise" or "die", "in step"
-    or "in reset"; or a signal, such as "SIGINT" or "SIGINT in reset", that the learner gets meanwhile.
+    or "in reset"; or a signal, such as "SIGINT" or "SIGINT in reset", that the learner gets meanwhile. A callback may
+    call ``go_wrong`` too.
     """
 
     def __init__(

@@ -44,7 +44,10 @@ PACKAGES = ("", ".diagnostics", ".diagnostics.plots", ".estimation", ".recurrent
 PUBLIC = tuple(f"sb3_reinforce{package}" for package in PACKAGES)
 PRIVATE = re.compile(r"_[a-z]\w*")
 
-TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
+TREES = {
+    path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
+    for path in sorted(ROOT.rglob("*.py"))
+}
 NODES = [(path, node) for path, tree in TREES.items() for node in ast.walk(tree)]
 
 
@@ -181,7 +184,7 @@ def test_diagnostics_read_only_what_is_public() -> None:
 
 
 def test_files_are_short() -> None:
-    lengths = {path: len((ROOT / path).read_text().splitlines()) for path in TREES.keys() - LONGER}
+    lengths = {path: len((ROOT / path).read_text(encoding="utf-8").splitlines()) for path in TREES.keys() - LONGER}
     assert {path: length for path, length in lengths.items() if length >= MAX_LINES} == {}
 
 
@@ -215,7 +218,7 @@ def test_public_names_are_there_and_documented(module_name: str) -> None:
 def test_every_named_function_is_in_the_docs_and_the_docstring(table: str) -> None:
     """What else is due when one is added; CONTRIBUTING.md lists the rest."""
     page = "rollouts.md" if table == "BASELINES" else "finite_difference.md"
-    text = (Path(__file__).parents[1] / "docs" / page).read_text()
+    text = (Path(__file__).parents[1] / "docs" / page).read_text(encoding="utf-8")
     algorithm = sb3_reinforce.REINFORCE if table == "BASELINES" else sb3_reinforce.FiniteDifference
     names = getattr(importlib.import_module("sb3_reinforce.estimation"), table)
     missing = [name for name in names if f'`"{name}"`' not in text or f'``"{name}"``' not in str(algorithm.__doc__)]

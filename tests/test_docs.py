@@ -19,7 +19,7 @@ from sb3_reinforce.diagnostics.pitfalls import PITFALLS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
-TEXTS = {path.name: path.read_text() for path in PAGES}
+TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
 # Budgets of the pages' blocks, and how CI cuts them
 SMALL = {
     r"learn\(\d[\d_]*": "learn(1_000",
@@ -90,7 +90,7 @@ SLOW = [name for name, found in RUN.items() if any("examples/benchmarks" in comm
 WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo) \w|\.py\b.* --")
 
 
-@pytest.mark.parametrize("name", [path.name for path in PAGES[1:] if blocks(path.read_text(), "python")])
+@pytest.mark.parametrize("name", [path.name for path in PAGES[1:] if blocks(TEXTS[path.name], "python")])
 @pytest.mark.filterwarnings("ignore")
 def test_python_blocks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, as one script, with small budgets. `.ci/wheel` runs the README's blocks as they stand."""
@@ -149,9 +149,9 @@ def options_of(command: str) -> str:
     """The source that defines the options of a command that starts Python."""
     zoo = re.search(r"(?:-m sb3_reinforce\.zoo|sb3-reinforce-zoo) (\w+)", command)
     if zoo:
-        return (Path(rl_zoo3.__file__).parent / f"{zoo[1]}.py").read_text()
+        return (Path(rl_zoo3.__file__).parent / f"{zoo[1]}.py").read_text(encoding="utf-8")
     script = re.search(r"python[\d.]* (\S+\.py)", command)
-    return (ROOT / script[1]).read_text() if script else ""
+    return (ROOT / script[1]).read_text(encoding="utf-8") if script else ""
 
 
 @pytest.mark.parametrize(("name", "command"), sorted(entry for entry in COMMANDS if WITH_OPTIONS.search(entry[1])))
@@ -169,17 +169,17 @@ def test_files_extras_and_make_targets_exist(name: str) -> None:
     assert not missing
     folder = next(path.parent for path in PAGES if path.name == name)
     assert all((folder / path).exists() for path in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text))
-    project = (ROOT / "pyproject.toml").read_text()
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     for extras in re.findall(r'pip install -e "\.\[([\w,]+)\]"', text):
         assert all(re.search(rf"^{extra} = \[", project, re.MULTILINE) for extra in extras.split(","))
-    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert {target for span in re.findall(r"`make ([\w -]+)`", text) for target in span.split()} <= {*targets}
 
 
 def test_named_tests_exist() -> None:
     for text in TEXTS.values():
         for path, test in re.findall(r"(tests/[\w/]+\.py)::(\w+)", text):
-            assert f"def {test}(" in (ROOT / path).read_text(), f"{path}::{test}"
+            assert f"def {test}(" in (ROOT / path).read_text(encoding="utf-8"), f"{path}::{test}"
 
 
 @pytest.mark.parametrize("name", [name for name, text in TEXTS.items() if "<!-- end -->" in text])

@@ -18,7 +18,7 @@ class Page(HTMLParser):
         self.anchors = {""}
         self.links: list[str] = []
         self.loaded: list[str] = []
-        self.feed(path.read_text())
+        self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         attributes = {name: value or "" for name, value in attrs}

@@ -15,10 +15,11 @@ def copy_pages(source: Path, target: Path) -> None:
     for path in source.glob("[0-9]*.py"):
         # With two digits, the order of the names is the order of the tutorial
         number, _, name = path.name.partition("_")
-        pages[f"{int(number):02}_{name}"] = path.read_text() + links(f"{int(number):02}_{name}", path.name)
+        page = f"{int(number):02}_{name}"
+        pages[page] = path.read_text(encoding="utf-8") + links(page, path.name)
     for name, text in pages.items():
-        if not (target / name).exists() or (target / name).read_text() != text:
-            (target / name).write_text(text)
+        if not (target / name).exists() or (target / name).read_text(encoding="utf-8") != text:
+            (target / name).write_text(text, encoding="utf-8")
     for path in target.glob("*.py"):
         if path.name not in pages:
             path.unlink()

@@ -15,7 +15,7 @@ DEFAULTS |= {"policy": "MlpPolicy", "normalize": "False", "train_env_kwargs": "{
 
 def shipped(task: str) -> dict[str, str]:
     """The shipped settings of a task, written as in ``tuning.csv``."""
-    published = yaml.safe_load(SETTINGS.read_text())
+    published = yaml.safe_load(SETTINGS.read_text(encoding="utf-8"))
     settings = {**published[task], "train_env_kwargs": published["train_env_kwargs"].get(task, {})}
     return DEFAULTS | {key: str(value).replace(" ", "") for key, value in settings.items()}
 

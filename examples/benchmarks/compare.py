@@ -75,7 +75,7 @@ class Run(NamedTuple):
 def settings_of(algorithm: str, task: str) -> dict[str, Any] | None:
     """The settings published for a task, its latest other version (peers), or any task; None where there are none."""
     folder = HYPERPARAMS if algorithm in OURS else Path(rl_zoo3.__file__).parent / "hyperparams"
-    published = yaml.safe_load((folder / f"{algorithm}.yml").read_text())
+    published = yaml.safe_load((folder / f"{algorithm}.yml").read_text(encoding="utf-8"))
     version = re.compile(re.escape(task.split("-v")[0]) + r"-v\d+")
     others = [] if algorithm in OURS else sorted(filter(version.fullmatch, published), reverse=True)
     general = [] if algorithm in SEARCHES else ["atari" if ExperimentManager.is_atari(task) else "default"]
@@ -188,7 +188,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     if is_leader() and not arguments.output.exists():
-        arguments.output.write_text(",".join(COLUMNS) + "\n")
+        arguments.output.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
     wanted = [
         Run(task, algorithm, seed, arguments.timesteps or BUDGETS.get(task, OTHER_BUDGET))
         for seed, task, algorithm in itertools.product(arguments.seeds, arguments.tasks, arguments.algorithms)

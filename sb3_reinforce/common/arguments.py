@@ -47,7 +47,7 @@ def check_number(name: str, value: Any, low: float, high: float = MAX, above: bo
         sign = ">" if above else ">="
         allowed = f"in {bracket}{low:g}, {high:g}]" if high < MAX else f"finite and {sign} {low:g}"
         if high == math.inf:
-            allowed = f"{sign} {low:g}, and inf for no bound"
+            allowed = f"{sign} {low:g} (inf or None for no bound)"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number
 
@@ -119,20 +119,17 @@ class CheckedSchedule(FloatSchedule):
             self(progress_remaining)
 
     def __call__(self, progress_remaining: float) -> float:
+        where = f"{self.name} (at progress_remaining={progress_remaining:g})"
         try:
             value: Any = self.value_schedule(progress_remaining)
         except Exception as error:
-            raise ValueError(
-                f"{self.name} must be a number or a function of the remaining progress, and {self.given!r} called with "
-                f"{progress_remaining:g} raised {error!r}"
-            ) from error
+            raise ValueError(f"{where} must be a number, but calling {self.given!r} raised {error!r}") from error
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
         if isinstance(value, float) and -SCHEDULE_ROUNDING < value < 0:
             # A LinearSchedule that ends at 0 may end below it by rounding
             value = 0.0
         # At the end of training nothing is drawn any more
         is_excluded = progress_remaining == 1 if self.may_reach_zero else progress_remaining > 0
-        where = f"{self.name} (at progress_remaining={progress_remaining:g})"
         return check_number(where, value, 0, self.high, self.above and is_excluded)
 
 

@@ -114,8 +114,8 @@ class BasePolicyGradient(Distributed):
         Get the policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
 
         :param observation: One observation, or a batch ``(n_envs, ...)``
-        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None at
-            the start of all episodes. Other policies pass it on
+        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None where all
+            episodes start. Other policies return it unchanged
         :param episode_start: Which observations start an episode, ``(n_envs,)``, for recurrent policies
         :param deterministic: Whether to return the most likely action instead of a sample
         :return: The action, or the actions ``(n_envs, *action_space.shape)``, and the next state
@@ -164,11 +164,11 @@ class BasePolicyGradient(Distributed):
             model's device) as they were saved. Training then continues as if it had not been interrupted, from a reset
             of the environments on; the file has neither the environments' state and generators nor the statistics of
             VecNormalize. If False, a model with a seed seeds them: call ``set_random_seed`` to use another
-        :param kwargs: Further arguments of ``load``, and arguments of the algorithm that replace the saved ones. An
-            ``lr_schedule`` that was set by hand is not stored
+        :param kwargs: Further arguments of ``load``, and arguments that replace the saved ones, except ``policy``,
+            ``policy_kwargs`` and ``stats_window_size``. An ``lr_schedule`` that was set by hand is not stored
         :return: The model
-        :raises TypeError: If an argument is of the wrong type, or the algorithm has none of this name
-        :raises ValueError: If an argument is out of its range, or the file is damaged
+        :raises TypeError: If an argument is of the wrong type, unknown, or cannot be replaced
+        :raises ValueError: If an argument is out of its range, or the file is damaged or of another algorithm
         """
         check_device("device", device)
         check_flag("restore_random_state", restore_random_state)

@@ -39,8 +39,9 @@ MAX_TEMPERATURE = 1e6
 MAX_STD = 1e6
 USE_RECURRENT = "a memory needs sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may be enough instead"
 USE_MASKED_POLICY = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
-RECURRENT = (*(f"{name}LstmPolicy" for name in ("Mlp", "Cnn", "MultiInput", "Masked")), "RecurrentActorCriticPolicy")
+RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
 CONTRIB_POLICIES = dict.fromkeys(RECURRENT, USE_RECURRENT) | {"MaskableActorCriticPolicy": USE_MASKED_POLICY}
+CONTRIB_POLICIES["MaskedLstmPolicy"] = USE_RECURRENT.partition(";")[0]
 NO_CLIPPING = "it takes one policy step per rollout, bounded by max_grad_norm, or with step='natural' by target_kl"
 USE_POLICY_KWARGS = "set policy_kwargs=dict(optimizer_class=..., optimizer_kwargs=...)"
 # Arguments of PPO and A2C, and what REINFORCE has instead

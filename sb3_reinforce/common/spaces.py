@@ -46,8 +46,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"observation_space must not be empty, got {observation_space}")
     for key, space in parts.items():
         name = f"observation_space[{key!r}]" if key else "observation_space"
-        dict_of = "" if key else ", or a Dict of these"
-        check_space(name, space, f"Box, Discrete, MultiDiscrete or MultiBinary{dict_of}")
+        supported = "Box, Discrete, MultiDiscrete or MultiBinary"
+        check_space(name, space, supported if key else "Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these")
         if isinstance(space, spaces.Box) and not space.shape:
             raise ValueError(f"{name} must have a dimension, got {space}: make its shape (1,)")
         if np.any(getattr(space, "start", 0)):

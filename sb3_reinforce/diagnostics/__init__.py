@@ -1,7 +1,7 @@
 """
 The gradient lab: how good the estimate of the gradient is, whether it is right, and what to change.
 
-Re-exports the public names of its modules. ``plots``, which needs matplotlib, is imported by itself.
+Re-exports the public names of its modules. Import ``sb3_reinforce.diagnostics.plots`` separately: it needs matplotlib.
 """
 
 from sb3_reinforce.diagnostics.baseline_comparison import BaselineRow, compare_baselines

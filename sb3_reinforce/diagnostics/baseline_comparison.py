@@ -26,9 +26,9 @@ class BaselineRow:
     :param baseline: Its name
     :param variance: tr Σ, the trace of the covariance of the gradient of one episode
     :param ratio: tr Σ divided by the tr Σ of the reference, from the same resamples of the same episodes
-    :param snr: ``‖E g‖² / tr Σ`` of one episode; the mean of N episodes has N times that
+    :param snr: ``‖E g‖² / tr Σ`` of one episode, NaN for the floor; the mean of N episodes has N times that
     :param bias: ``‖E g − E g_none‖ / ‖E g_none‖`` where it is known in theory, else NaN
-    :param seconds: Time to compute b_t
+    :param seconds: Time to compute b_t; NaN for the floor
     """
 
     baseline: str
@@ -70,9 +70,9 @@ def compare_baselines(
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: A table with one ``BaselineRow`` per baseline
     :raises TypeError: If the model is not a REINFORCE, or a baseline neither a name nor callable
-    :raises ValueError: If an argument is out of its range, a name is unknown or used twice, ``"value"`` is given
-        without a critic, the reference is not among the baselines, or the episodes are not independent because they
-        share the noise of gSDE
+    :raises ValueError: If an argument is out of its range, a name is unknown, belongs to two functions or is
+        ``"floor"``, ``"value"`` is given without a critic, the reference is not among the baselines, the model has no
+        environment or is collecting a rollout, or the episodes are not independent because they share the noise of gSDE
     """
     check_model(model, independent=True)
     if baselines is None:
@@ -105,7 +105,8 @@ def functions_of(baselines: Any) -> dict[str, Baseline]:
     is_single = isinstance(baselines, str) or not isinstance(baselines, Iterable)
     for baseline in [baselines] if is_single else baselines:
         function = check_function("baselines", baseline, BASELINES)
-        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", type(baseline).__name__)
+        unnamed = f"{type(baseline).__name__}_{len(functions)}"
+        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", unnamed)
         if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(
                 f"baselines must have names that differ from each other and from 'floor', and {name!r} is taken: set "

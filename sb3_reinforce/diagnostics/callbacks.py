@@ -114,8 +114,9 @@ class GradientQualityCallback(Diagnosis):
         """
         Compute what is logged of a rollout, apart from the cosine.
 
-        :param rollout: The rollout, before the model trains on it
-        :return: The figures by the last part of their key
+        :param rollout: ``model.rollout``, before the model trains on it
+        :return: The figures by their keys without ``gradient/``; empty with fewer than two episodes or with
+            ``episodes_per_start``
         """
         n_episodes = len(rollout.used_episodes)
         # Episodes that share their start are not independent
@@ -136,7 +137,8 @@ class PitfallCallback(Diagnosis):
     """
     Warns once about each of nine known pitfalls of the policy gradient, and names the argument to change.
 
-    Where several pitfalls have one cause, only the cause is reported.
+    Where several pitfalls have one cause, only the cause is reported. ``found`` has the warnings so far, by the name of
+    the pitfall.
 
     The pitfalls: a learning rate that is too large; one that is too small for the number of updates; returns that are
     not scaled; too few episodes; the total return; gradients that spike without clipping; a critic that explains hardly

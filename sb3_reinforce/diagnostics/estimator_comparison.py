@@ -83,7 +83,7 @@ def compare_estimators(
     perturbations. The cosine belongs to its expectation, which for small perturbations of a built-in kind is a multiple
     of the gradient.
 
-    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param model: The model; it is not changed. Its environments get new seeds, and are left at the start of an episode
     :param n_episodes: Episodes of the likelihood ratio, and as many again for the reference gradient, at least 3
     :param n_estimates: Estimates with each of the others, at least 3; below about 20 the intervals are too narrow
     :param estimators: ``"likelihood_ratio"``, ``"forward"``, ``"central"``, ``"regression"``
@@ -98,8 +98,9 @@ def compare_estimators(
     :param progress_bar: Display a bar of tqdm that counts the episodes of the differences
     :return: A table with one ``EstimatorRow`` per estimator
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
-    :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment, or its
-        episodes are not independent because they share the noise of gSDE
+    :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment or is
+        collecting a rollout, the policy has a memory, the environments cannot be seeded one by one, or the episodes are
+        not independent because they share the noise of gSDE
     """
     check_model(model, (REINFORCE, FiniteDifference), independent=True)
     check_kind("estimators", estimators, (Iterable,), "names")

@@ -89,10 +89,10 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
       ``discount_scores`` and ``normalize_advantage`` are taken into account.
     - ``surrogate``: the step of ``train()`` is the sum of the weighted scores.
 
-    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before
-    the last are trained: Stable-Baselines3 detaches the features on which the standard deviation depends, unless
-    ``policy.action_dist.learn_features`` is set. It can also fail by rounding if observations are far from 1, below
-    about 0.01 or above 1,000: normalize them.
+    Custom policies and subclasses of REINFORCE are checked as they are. With gSDE ``scores`` fails if layers before the
+    last are trained: Stable-Baselines3 detaches the features on which the standard deviation depends, unless
+    ``policy.action_dist.learn_features`` is set. ``scores`` can also fail by rounding if observations are far from 1,
+    below about 0.01 or above 1,000: normalize them.
 
     :param model: The model; it is not changed, but a baseline with memory learns from these episodes too. The
         environments are left at the start of an episode
@@ -100,7 +100,8 @@ def check_gradient(model: REINFORCE, n_episodes: int = 4, seed: int = 0) -> Chec
     :param seed: Seed of the actions and of the directions of the finite differences
     :return: A table with one ``CheckRow`` per item; ``.passed`` is True if all of them pass
     :raises TypeError: If the model is not a REINFORCE
-    :raises ValueError: If an argument is out of its range, or log π cannot be differentiated
+    :raises ValueError: If an argument is out of its range, log π cannot be differentiated, or the model has no
+        environment or is collecting a rollout
     """
     check_model(model)
     check_integer("n_episodes", n_episodes, 2)

@@ -29,11 +29,16 @@ class CandidateUtility:
     step has new noise, as with ``sde_sample_freq=1``. Candidates share their seeds as in FiniteDifference; every call
     uses new ones.
 
+    Call it with candidates of shape ``(k, n)`` or ``(m, k, n)``. It returns their utilities, ``(k,)`` or ``(m, k)``,
+    float64. ``theta`` has the model's own parameters, ``(n,)``. Each call leaves the environments at the start of an
+    episode, with new seeds from NumPy's global generator.
+
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility
-    :param seed: Seed of the episodes
+    :param seed: Seed of the environments. PyTorch's global generator draws the actions: call ``th.manual_seed`` to
+        repeat them
     :raises TypeError: If the model has no actor-critic policy
-    :raises ValueError: If it has no environments
+    :raises ValueError: If it has no environments, or its policy has a memory
     """
 
     def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
@@ -111,20 +116,22 @@ def landscape(
     """
     Evaluate the utility on a plane through θ.
 
-    :param model: A model with an actor-critic policy; it is not changed. The environments are reset, so A2C and PPO
-        must not be measured in ``on_step``, and cannot continue their ``learn`` after a measurement that failed
-    :param gradients: Gradients of the actor's parameters without ``log_std`` to draw, by name, each of shape ``(n,)``,
-        or ``(m, n)`` for several estimates of one gradient
+    :param model: A model with an actor-critic policy; it is not changed. The environments are reset and get new seeds,
+        so A2C and PPO must not be measured in ``on_step``, and cannot continue their ``learn`` after a measurement that
+        failed
+    :param gradients: Gradients to draw, by name, for the actor's parameters without ``log_std``: each of shape
+        ``(n,)``, or ``(m, n)`` for several estimates of one gradient
     :param directions: Two directions of shape ``(2, n)``, which are scaled to the norm of θ; None for two random ones,
         normalized filter by filter (Li et al., 2018, section 4)
     :param extent: Half the width of the plane, in multiples of the directions
-    :param n_points: Points along each side
+    :param n_points: Points along each side, at least 2
     :param n_episodes: Episodes per point
     :param seed: Seed of the directions and of the episodes
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The utilities on the plane, and the projections of the gradients
     :raises TypeError: If an argument is of the wrong kind
-    :raises ValueError: If an argument is out of its range or of the wrong shape
+    :raises ValueError: If an argument is out of its range or of the wrong shape, all parameters are 0, the model has no
+        environment or is collecting a rollout, the policy has a memory, or the environments cannot be seeded one by one
     """
     check_number("extent", extent, 0, above=True)
     check_integer("n_points", n_points, 2)

@@ -149,7 +149,7 @@ def too_few_episodes(history: History) -> str | None:
     if ratio < 0.1 or math.isnan(ratio):
         argument = "n_episodes" if history.model.n_steps is None else "n_steps, or the number of environments"
         if history.model.episodes_per_start > 1:
-            argument = "the number of environments"
+            argument = "the number of environments, and n_episodes with it if it is set"
         shown = f"{ratio:.2g}" if ratio > 0 else "not distinguishable from 0"
         return (
             f"The gradient is mostly noise: over the last {len(gradients)} updates its signal-to-noise ratio is "

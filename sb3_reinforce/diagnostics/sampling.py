@@ -26,10 +26,12 @@ def sample(
     model: REINFORCE, n_episodes: int, baseline: str | Baseline | None = None, progress_bar: bool = False
 ) -> Rollout:
     """
-    Whole episodes of the model's policy in its environments, with the model's own returns.
+    Whole episodes of the model's policy in its environments, with the model's own returns (λ = 1 where ``baseline`` is
+    not ``"value"``).
 
     The model keeps its parameters, counters and log, and a VecNormalize keeps its statistics. The environments are left
-    at the start of an episode.
+    at the start of an episode, and the policy in evaluation mode. PyTorch's global generator draws the actions, and is
+    not restored.
 
     With gSDE the episodes share noise, unless ``sde_sample_freq=1``, and are not independent samples.
 
@@ -39,8 +41,9 @@ def sample(
         else ``"none"``
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The rollout; it has ``values`` only if the baseline is ``"value"``
-    :raises TypeError: If the model is not a REINFORCE
-    :raises ValueError: If there are too few episodes, or the model has no environment
+    :raises TypeError: If the model is not a REINFORCE, or the baseline neither a name nor a function
+    :raises ValueError: If there are too few episodes, the baseline is unknown, or the model has no environment or is
+        collecting a rollout
     """
     check_model(model)
     collector = sampling_copy(model, check_integer("n_episodes", n_episodes, 2), baseline)

@@ -30,7 +30,7 @@ class StartReport:
     What ``compare_starts`` returns.
 
     :param share: The share of the variance of the return that lies between starts, from 0 to 1
-    :param gains: By m, the variance of the gradient with independent starts divided by the variance with
+    :param gains: By m (2, 4 and 8), the variance of the gradient with independent starts divided by the variance with
         ``episodes_per_start=m``, both with ``"leave_one_out"`` and rollouts of ``n_starts`` episodes. Above 1 it pays
     """
 
@@ -68,7 +68,8 @@ def compare_starts(
     :return: The share and the predicted gains
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If an argument is out of its range, if the episodes are not independent because they share the
-        noise of gSDE, or if an environment does not start alike from the same seed
+        noise of gSDE, if an environment does not start alike from the same seed, or if the model has no environment or
+        is collecting a rollout
     """
     check_model(model, independent=True)
     env = env_of(model)

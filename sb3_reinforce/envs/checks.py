@@ -55,9 +55,10 @@ def check_length(n_steps: int, max_episode_steps: float, alternative: str = "") 
 
 def as_reset(returned: Any, env: int) -> tuple[Any, dict[str, Any]]:
     """The observation and info that an environment's reset must return; OpenAI Gym's returned the observation alone."""
-    if not (isinstance(returned, tuple) and len(returned) == 2):
+    if not (isinstance(returned, (tuple, list)) and len(returned) == 2):
         raise BadData(f"reset of environment {env} must return (observation, info), got {returned!r}")
-    return returned
+    obs, info = returned
+    return obs, info
 
 
 def as_reward(reward: Any, env: int) -> float:

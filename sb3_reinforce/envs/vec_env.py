@@ -52,7 +52,7 @@ class GymnasiumVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all copies with the pending seeds and options, which must be the same for all."""
+        """Reset all copies with the pending seed and options; the options must be equal for all copies."""
         first = self._options[0]
         if not all(options is first or data_equivalence(options, first, exact=True) for options in self._options):
             raise ValueError(f"set_options must give all copies of a vector environment the same, got {self._options}")

@@ -47,7 +47,7 @@ def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_
     ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, error of order 2 in ‖Δ‖; exact on quadratic utilities
     if the perturbations span all dimensions.
 
-    :param utility: U
+    :param utility: U, which gets all candidates at once, shape ``(2, k, n)``, and returns ``(2, k)``
     :param theta: θ, shape ``(n,)``
     :param deltas: Δ, shape ``(k, n)``
     :param n_top: Use only the perturbations with the n_top largest max(U(θ + δ), U(θ − δ)) (Mania et al., 2018,

@@ -33,7 +33,7 @@ class Rollout:
     :param discounts: The factor of the score besides G_t − b_t: γ^t with ``discount_scores`` and
         ``reward_to_go``, else 1; float64
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``
-    :param policy: The policy that acted, with the parameters with which it acted
+    :param policy: The policy that acted; its parameters are those of the rollout until ``train`` changes them
     :param denominator: What the sum over all steps is divided by
     :param next_values: V(s_{t+1}), which is 0 after a terminal state, float64; None without ``baseline="value"``
     :param state: The state of a recurrent policy before the first step, shape

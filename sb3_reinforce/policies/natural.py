@@ -56,6 +56,8 @@ def natural_step(
     The parameters stay as they are, with a warning, where no such step is found.
     """
     parameters = [each for each, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
+    if not parameters:
+        return 0.0, 0.0
     g = to_vector(gradients)
     norm = finite_norm(g, "policy", "scaled rewards (VecNormalize)")
     # A schedule may fall to a target of 0

@@ -30,9 +30,12 @@ class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
     :param lstm_hidden_size: Hidden units of each layer, 256 by default
     :param n_lstm_layers: Number of layers, 1 by default
     :param enable_critic_lstm: Whether the critic has a separate memory, True by default
-    :param shared_lstm: Whether the critic reads the actor's memory, without training it; False by default
+    :param shared_lstm: Whether the critic reads the actor's memory, without training it; False by default. It needs
+        ``enable_critic_lstm=False`` and a shared features extractor
     :param lstm_kwargs: ``bias``, ``dropout``, and ``nonlinearity`` of ``"rnn"``
     :param kwargs: As for ``ActorCriticPolicy``
+    :raises TypeError: If a number of units or layers is not an integer
+    :raises ValueError: If ``memory`` or ``lstm_kwargs`` is unknown, or a number is below 1
     """
 
 

@@ -150,7 +150,7 @@ def goes_on(callback: BaseCallback) -> bool:
     """Call a callback at a step; None stops training as False does, usually by mistake."""
     answer: bool | None = callback.on_step()
     if answer is None:
-        warnings.warn("callback returned None, which stops training: return True to go on", stacklevel=3)
+        warnings.warn("A callback returned None, which stops training: return True to go on", stacklevel=3)
     return bool(answer)
 
 

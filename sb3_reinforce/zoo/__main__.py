@@ -115,7 +115,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         try:
             if env_kwargs:
                 gym.make(given.env, **dict(env_kwargs)).close()
-        except (TypeError, ValueError) as error:
+        except (AssertionError, TypeError, ValueError) as error:
             parser.error(f"{option}: {error}")
     if command != "train":
         check_trained_model(parser, command, given)

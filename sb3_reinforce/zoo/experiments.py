@@ -99,8 +99,8 @@ class Experiment(exp_manager.ExperimentManager):
                     f"{self.storage}: pass another --trial-id, --study-name or --storage"
                 ) from error
         replaced = self.custom_hyperparams or {}
-        if self.continue_training and (fixed := {"policy", "policy_kwargs"} & replaced.keys()):
-            raise ConfigurationError(f"--trained-agent keeps the model's policy: leave out -params {min(fixed)}")
+        if self.continue_training and (fixed := {"policy", "policy_kwargs", "stats_window_size"} & replaced.keys()):
+            raise ConfigurationError(f"--trained-agent keeps the model's {min(fixed)}: leave it out of -params")
         found.update(replaced)
         for key in ("env_kwargs", "vec_env_wrapper"):
             # enjoy fails where a key is there without a value
@@ -117,6 +117,9 @@ class Experiment(exp_manager.ExperimentManager):
             self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
+        if self.continue_training:
+            # load cannot replace it
+            found.pop("stats_window_size", None)
         if found.pop(TRAIN_ENV_KWARGS, None):
             # The Zoo's commands read env_kwargs from the saved settings too, for the environments that they show
             found["env_kwargs"] = {**keywords["env_kwargs"], **keywords[TRAIN_ENV_KWARGS], **self.env_kwargs}
@@ -144,10 +147,7 @@ def find_settings(experiment: Experiment) -> Settings:
     if experiment.model_config is not None:
         print(f"Continuing with the settings of the model: {experiment.model_config}")
         # The Zoo writes an OrderedDict, which safe_load refuses
-        own = dict(yaml.unsafe_load(experiment.model_config.read_text(encoding="utf-8")))
-        # The model keeps its window, which load cannot replace
-        own.pop("stats_window_size", None)
-        return own
+        return dict(yaml.unsafe_load(experiment.model_config.read_text(encoding="utf-8")))
     config, env_id = experiment.config, experiment.env_name.gym_id
     print(f"Loading hyperparameters from: {config}")
     published = as_dict(f"The content of {config}", load_configuration(config))

@@ -134,10 +134,13 @@ def as_dict(key: str, value: Any) -> Settings:
     result = {} if value is None or (key == "normalize" and isinstance(value, bool)) else value
     if isinstance(value, str) and key in PYTHON_KEYS:
         try:
-            # The Zoo reads normalize once more, in the module utils
-            result = eval(value, dict(vars(utils if key == "normalize" else exp_manager)))
+            # enjoy evaluates normalize in the module utils
+            for module in (utils, exp_manager) if key == "normalize" else (exp_manager,):
+                result = eval(value, dict(vars(module)))
         except Exception as error:
-            raise ConfigurationError(f"{key} must be Python, but {value!r} raises {error!r}") from error
+            raise ConfigurationError(
+                f"{key} must be Python that the Zoo can evaluate, but {value!r} raises {error!r}"
+            ) from error
     if not isinstance(result, dict):
         flag = "True, False or " if key == "normalize" else ""
         raise ConfigurationError(f"{key} must be {flag}a dict, got {value!r}")

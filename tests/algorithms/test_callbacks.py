@@ -79,7 +79,7 @@ def test_a_callback_stops_training_at_the_very_step(kind):
 @all_kinds
 def test_a_callback_that_forgets_to_return_true_is_named(kind):
     model = make(kind, Corridor())
-    with pytest.warns(UserWarning, match="callback returned None, which stops training: return True to go on"):
+    with pytest.warns(UserWarning, match="A callback returned None, which stops training: return True to go on"):
         model.learn(64, lambda *_: None)
     assert model.num_timesteps == 1
 

@@ -1,6 +1,7 @@
 """Baselines compared on the same episodes: against closed forms on a bandit, and on CartPole."""
 
 import sys
+from functools import partial
 
 import numpy as np
 import pandas
@@ -176,6 +177,15 @@ def test_a_users_function_is_a_row_and_the_table_prints():
     assert table.to_records()[1]["variance_low"] == table["half"].variance.low
     with pytest.raises(ValueError, match=r"'none', 'half', 'floor', got 'mean'"):
         table["mean"]
+
+
+def test_baselines_without_a_name_are_numbered():
+    def constant(rollout, value):
+        return th.full_like(rollout.returns, value)
+
+    baselines = [partial(constant, value=value) for value in (0.5, 1.0)]
+    table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10, baselines)
+    assert table.names == ["none", "partial_1", "partial_2", "floor"]
 
 
 def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):

@@ -197,29 +197,34 @@ def test_an_interrupted_step(number, kind, workers):
 
 
 @pytest.mark.parametrize(
-    ("kind", "fault", "at"),
+    ("kind", "fault", "at", "mode"),
     [
-        ("steps", "SIGTERM", 20),
-        ("steps", "SIGINT", 20),
-        ("steps", "SIGTERM in reset", 1),
+        ("steps", "SIGTERM", 20, "SameStep"),
+        ("steps", "SIGINT", 20, "Disabled"),
+        ("steps", "SIGTERM in reset", 1, "SameStep"),
         # After an episode
-        ("steps", "SIGTERM in reset", 2),
+        ("steps", "SIGTERM in reset", 2, "SameStep"),
+        ("steps", "SIGTERM in reset", 2, "Disabled"),
         # By env_method, with a seed
-        ("search", "SIGTERM in reset", 3),
+        ("search", "SIGTERM in reset", 3, "Disabled"),
+        ("steps", "SIGTERM in a callback", 0, "SameStep"),
     ],
 )
-def test_an_interrupted_call_of_gymnasiums_processes(kind, fault, at):
+def test_an_interrupted_call_of_gymnasiums_processes(kind, fault, at, mode):
     """It is finished first: what its processes have answered could not be told from their later answers."""
-    envs = AsyncVectorEnv(faulty(fault=fault, at=at), context="fork", autoreset_mode="Disabled")
+    envs = AsyncVectorEnv(faulty(fault=fault, at=at), context="fork", autoreset_mode=mode)
+    watchdog = threading.Timer(120, lambda: [process.kill() for process in envs.processes])
+    watchdog.start()
     try:
         model = make(kind, GymnasiumVecEnv(envs), **({"common_random_numbers": True} if kind == "search" else {}))
         with pytest.raises(KeyboardInterrupt):
-            model.learn(400)
+            model.learn(400, At(9, lambda model: model.env.env_method("go_wrong", "a callback")))
         before, n_steps = envs.get_attr("n_steps"), model.num_timesteps
         model.learn(90, reset_num_timesteps=False)
         made = [after - each for after, each in zip(envs.get_attr("n_steps"), before, strict=True)]
         assert made == [(model.num_timesteps - n_steps) // 3] * 3
     finally:
+        watchdog.cancel()
         envs.close(terminate=True)
 
 

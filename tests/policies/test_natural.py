@@ -285,10 +285,11 @@ def test_a_step_that_is_far_too_long_is_not_shortened_to_nothing():
 
 
 class OwnEntropy(ActorCriticPolicy):
-    """Adds a parameter to the entropy, on which the distribution does not depend."""
+    """Adds a parameter to the entropy, on which the distribution does not depend, and has one without any use."""
 
     def _build(self, lr_schedule):
         self.bonus = th.nn.Parameter(th.zeros(()))
+        self.unused = th.nn.Parameter(th.zeros(()))
         super()._build(lr_schedule)
 
     def evaluate_actions(self, obs, actions):
@@ -299,6 +300,8 @@ class OwnEntropy(ActorCriticPolicy):
 def test_parameters_on_which_the_distribution_does_not_depend():
     model = make("steps", Corridor(), OwnEntropy, step="natural", ent_coef=0.01).learn(32)
     assert model.policy.bonus > 0 and model.logger.name_to_value["train/kl"] > 0
+    model.policy.optimizer = th.optim.Adam([*model.policy.value_net.parameters(), model.policy.unused])
+    assert model.learn(32).logger.name_to_value["train/grad_norm"] == 0
 
 
 class OtherFeatures(ActorCriticPolicy):

@@ -148,6 +148,16 @@ def test_a_task_that_is_not_registered_is_named_at_once(tmp_path, capsys):
     assert "--tasks: Nope-v5 not registered" in capsys.readouterr().err and not any(tmp_path.iterdir())
 
 
+def test_a_run_that_is_there_twice_is_refused(plots, tmp_path, monkeypatch, capsys):
+    row = "CartPole-v1,reinforce,0,600,final,600,1.0,1.0,9.0,1.0,5"
+    (tmp_path / "rows.csv").write_text(f"{','.join(compare.COLUMNS)}\n{row}\n")
+    path = str(tmp_path / "rows.csv")
+    monkeypatch.setattr(sys, "argv", ["compare_plots.py", path, path, "--output", str(tmp_path / "picture")])
+    with pytest.raises(SystemExit):
+        plots.main()
+    assert "'seed': 0, 'budget': 600} twice" in capsys.readouterr().err
+
+
 def test_a_curve_is_the_interquartile_mean_between_the_evaluations(plots):
     returns = {0: (0, -50), 1: (0, 8), 2: (0, 12), 3: (0, 90)}
     rows = [(seed, steps, value) for seed, each in returns.items() for steps, value in zip((0, 100), each, strict=True)]
