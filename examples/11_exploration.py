@@ -61,8 +61,8 @@ assert means[0.0] < -0.7 and means[1.5] > 1
 # adds $c \sum_t \nabla H(\pi(\cdot \mid s_t))$ to the gradient, which for one step is the gradient of
 # $E[\text{return}] + c H$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. At
 # temperature 1 the policy starts with a probability of 0.999 for the worst arm, and hardly sees the others. Without a
-# schedule the policy mostly stays there. A schedule lets it try them first, and decide later: at temperature 5 the
-# worst arm has only 0.71.
+# schedule the policy mostly keeps choosing the worst arm. With a schedule it tries the other arms first and decides
+# later: at temperature 5 the worst arm has a probability of only 0.71.
 
 
 # %%

@@ -66,10 +66,11 @@ class FiniteDifference(BasePolicyGradient):
     searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward pass,
     other policies one after the other.
 
-    The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. Afterwards
-    its observations are added. The first update uses the statistics of the first reset. Utilities are sums of the
-    rewards before any scaling by it. If a custom wrapper above it may change rewards, they are sums of that wrapper's
-    rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or ``training=False``).
+    The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. The
+    observations of an update are added to them afterwards. The first update uses the statistics of the first reset.
+    Utilities are sums of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they
+    are sums of that wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or
+    ``training=False``).
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -238,9 +239,10 @@ class FiniteDifference(BasePolicyGradient):
         :return: The trained model
         :raises TypeError: If an argument is of the wrong type
         :raises ValueError: If an argument is out of its range, the model has no environment, PyTorch's default device
-            is not the CPU, processes under torchrun have different arguments, a perturbation, reward, observation,
-            action or gradient is not finite, all perturbations are zero (for ``"regression"``: equal), or an episode
-            does not end. The policy is the last good one
+            is not the CPU, processes under torchrun have different arguments, nothing is left to search, a user's
+            estimator or perturbation returns another shape, a perturbation, reward, observation or action is not
+            finite, all perturbations are zero (for ``"regression"``: equal), or an episode does not end; and as in
+            ``train``. The policy is the last good one
         :raises ConnectionError: If a worker of a ``SubprocVecEnv`` dies
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
@@ -276,7 +278,8 @@ class FiniteDifference(BasePolicyGradient):
     def estimate_gradient(self, callback: BaseCallback) -> GradientEstimate | None:
         """
         Perturb θ, evaluate the candidates and estimate ∇U(θ). θ does not change. The policy is left in evaluation mode.
-        The counts of steps and episodes, the statistics of VecNormalize and the generator of the perturbations go on.
+        It advances the counts of steps and episodes and the generator of the perturbations, and updates the statistics
+        of VecNormalize.
 
         ``learn`` calls it. If you call it yourself, seed the environments again afterwards (``env.seed``): with common
         random numbers all have the seed of the last candidates.

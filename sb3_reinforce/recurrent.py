@@ -64,8 +64,8 @@ class RecurrentREINFORCE(REINFORCE):
     :param kwargs: All other arguments of :class:`~sb3_reinforce.REINFORCE`
     :raises TypeError: If an argument is of the wrong type
     :raises ValueError: If an argument is out of its range, the policy has no memory, or a subclass of a policy
-        overrides ``forward``, ``evaluate_actions`` or ``get_distribution`` without ``sequence_distribution``, or
-        ``predict_values`` without ``sequence_values``
+        overrides a method for single steps without the one for sequences, such as ``get_distribution`` without
+        ``sequence_distribution``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -44,7 +44,7 @@ REFERENCES = {
     "Walker2d-v5": (1.8, 3479.0),
     "Swimmer-v5": (0.8, 281.6),
     "Ant-v5": (-48.0, 1327.0),
-    # Tasks without velocities: random actions earn the same as with them, and the good return is RecurrentPPO's
+    # Tasks without velocities: random actions earn what they earn in the full tasks; RecurrentPPO in benchmark.md
     "CartPoleNoVel-v1": (23.7, 500.0),
     "MountainCarContinuousNoVel-v0": (-33.3, 91.5),
     "PendulumNoVel-v1": (-1207.6, -217.9),
@@ -173,7 +173,7 @@ def main() -> None:
     runs = results.loc[results["evaluation"] == "final", ["task", "algorithm", "seed", "budget"]]
     if runs.duplicated().any():
         twice = runs[runs.duplicated()].iloc[0].to_dict()
-        parser.error(f"results have {twice} twice: leave out one of the files or its rows")
+        parser.error(f"results have {twice} twice: remove the second file or the repeated rows")
     order = [*LABELS, *sorted(set(results["algorithm"]) - LABELS.keys())]
     results = results.sort_values(
         ["task", "budget", "algorithm"],

@@ -123,7 +123,10 @@ class CheckedSchedule(FloatSchedule):
         try:
             value: Any = self.value_schedule(progress_remaining)
         except Exception as error:
-            raise ValueError(f"{where} must be a number, but calling {self.given!r} raised {error!r}") from error
+            raise ValueError(
+                f"{where} must be a number or a function of the remaining progress, but calling {self.given!r} raised "
+                f"{error!r}"
+            ) from error
         value = value.item() if getattr(value, "shape", None) in ((), (1,)) else value
         if isinstance(value, float) and -SCHEDULE_ROUNDING < value < 0:
             # A LinearSchedule that ends at 0 may end below it by rounding

@@ -114,8 +114,8 @@ class BasePolicyGradient(Distributed):
         Get the policy's action, as the environment takes it: a Discrete or MultiDiscrete action counts from its start.
 
         :param observation: One observation, or a batch ``(n_envs, ...)``
-        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None where all
-            episodes start. Other policies return it unchanged
+        :param state: The last state of a recurrent policy, two arrays ``(n_layers, n_envs, n_hidden)``; None if every
+            observation starts an episode. Other policies return it unchanged
         :param episode_start: Which observations start an episode, ``(n_envs,)``, for recurrent policies
         :param deterministic: Whether to return the most likely action instead of a sample
         :return: The action, or the actions ``(n_envs, *action_space.shape)``, and the next state
@@ -168,7 +168,7 @@ class BasePolicyGradient(Distributed):
             ``policy_kwargs`` and ``stats_window_size``. An ``lr_schedule`` that was set by hand is not stored
         :return: The model
         :raises TypeError: If an argument is of the wrong type, unknown, or cannot be replaced
-        :raises ValueError: If an argument is out of its range, or the file is damaged or of another algorithm
+        :raises ValueError: If an argument is out of its range or ``policy_kwargs`` differ, or the file is not valid
         """
         check_device("device", device)
         check_flag("restore_random_state", restore_random_state)

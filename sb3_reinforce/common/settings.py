@@ -72,10 +72,10 @@ def check_policy_name(policy: str | type, known: Mapping[str, Any]) -> None:
     """Check that the algorithm knows the name of a policy, or can train its class."""
     if policy in known or policy in known.values():
         return
-    names = {policy} if isinstance(policy, str) else {each.__name__ for each in policy.__mro__}
-    for name in names & CONTRIB_POLICIES.keys():
-        given = policy if isinstance(policy, str) else policy.__name__
-        raise ValueError(f"policy must be one that this algorithm trains, got {given}: {CONTRIB_POLICIES[name]}")
+    names = [policy] if isinstance(policy, str) else [each.__name__ for each in policy.__mro__]
+    for name in names:
+        if name in CONTRIB_POLICIES:
+            raise ValueError(f"policy must be one that this algorithm trains, got {names[0]}: {CONTRIB_POLICIES[name]}")
     if isinstance(policy, str):
         raise unknown_name("policy", "a class or one of", known, policy)
 

@@ -102,11 +102,14 @@ def compare_baselines(
 def functions_of(baselines: Any) -> dict[str, Baseline]:
     """Check names and functions of baselines, and return the functions by name, ``"none"`` first."""
     functions: dict[str, Baseline] = {"none": BASELINES["none"]}
+    n_unnamed = 0
     is_single = isinstance(baselines, str) or not isinstance(baselines, Iterable)
     for baseline in [baselines] if is_single else baselines:
         function = check_function("baselines", baseline, BASELINES)
-        unnamed = f"{type(baseline).__name__}_{len(functions)}"
-        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", unnamed)
+        name = baseline if isinstance(baseline, str) else getattr(baseline, "__name__", None)
+        if name is None:
+            n_unnamed += 1
+            name = f"{type(baseline).__name__}_{n_unnamed}"
         if name == "floor" or functions.get(name, function) is not function:
             raise ValueError(
                 f"baselines must have names that differ from each other and from 'floor', and {name!r} is taken: set "

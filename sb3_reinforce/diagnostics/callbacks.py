@@ -116,7 +116,7 @@ class GradientQualityCallback(Diagnosis):
 
         :param rollout: ``model.rollout``, before the model trains on it
         :return: The figures by their keys without ``gradient/``; empty with fewer than two episodes or with
-            ``episodes_per_start``
+            ``episodes_per_start`` above 1
         """
         n_episodes = len(rollout.used_episodes)
         # Episodes that share their start are not independent

@@ -38,7 +38,8 @@ class CandidateUtility:
     :param seed: Seed of the environments. PyTorch's global generator draws the actions: call ``th.manual_seed`` to
         repeat them
     :raises TypeError: If the model has no actor-critic policy
-    :raises ValueError: If it has no environments, or its policy has a memory
+    :raises ValueError: If it has no environments, its policy has a memory or nothing to train, or a number is out of
+        its range
     """
 
     def __init__(self, model: BaseAlgorithm, n_episodes: int, seed: int):
@@ -130,8 +131,9 @@ def landscape(
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The utilities on the plane, and the projections of the gradients
     :raises TypeError: If an argument is of the wrong kind
-    :raises ValueError: If an argument is out of its range or of the wrong shape, all parameters are 0, the model has no
-        environment or is collecting a rollout, the policy has a memory, or the environments cannot be seeded one by one
+    :raises ValueError: If an argument is out of its range or of the wrong shape, all of the actor's parameters are 0,
+        the model has no environment or is collecting a rollout, the policy has a memory, or the environments cannot be
+        seeded one by one
     """
     check_number("extent", extent, 0, above=True)
     check_integer("n_points", n_points, 2)

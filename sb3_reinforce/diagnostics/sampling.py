@@ -26,8 +26,7 @@ def sample(
     model: REINFORCE, n_episodes: int, baseline: str | Baseline | None = None, progress_bar: bool = False
 ) -> Rollout:
     """
-    Whole episodes of the model's policy in its environments, with the model's own returns (λ = 1 where ``baseline`` is
-    not ``"value"``).
+    Whole episodes of the model's policy in its environments, with the model's own returns.
 
     The model keeps its parameters, counters and log, and a VecNormalize keeps its statistics. The environments are left
     at the start of an episode, and the policy in evaluation mode. PyTorch's global generator draws the actions, and is
@@ -38,7 +37,7 @@ def sample(
     :param model: The model
     :param n_episodes: Number of episodes, at least 2
     :param baseline: The baseline to collect with, a name or a function; None for ``"value"`` if the model has a critic,
-        else ``"none"``
+        else ``"none"``. With another one than ``"value"`` λ is 1
     :param progress_bar: Display a bar of tqdm that counts the episodes
     :return: The rollout; it has ``values`` only if the baseline is ``"value"``
     :raises TypeError: If the model is not a REINFORCE, or the baseline neither a name nor a function

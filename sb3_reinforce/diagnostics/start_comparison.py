@@ -68,8 +68,8 @@ def compare_starts(
     :return: The share and the predicted gains
     :raises TypeError: If the model is not a REINFORCE
     :raises ValueError: If an argument is out of its range, if the episodes are not independent because they share the
-        noise of gSDE, if an environment does not start alike from the same seed, or if the model has no environment or
-        is collecting a rollout
+        noise of gSDE, if an environment does not start alike from the same seed or cannot be seeded alone, or if the
+        model has no environment or is collecting a rollout
     """
     check_model(model, independent=True)
     env = env_of(model)

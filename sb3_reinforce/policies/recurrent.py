@@ -34,6 +34,7 @@ class MlpLstmPolicy(RecurrentPolicy, RecurrentActorCriticPolicy):
         ``enable_critic_lstm=False`` and a shared features extractor
     :param lstm_kwargs: ``bias``, ``dropout``, and ``nonlinearity`` of ``"rnn"``
     :param kwargs: As for ``ActorCriticPolicy``
+    :raises AssertionError: If ``shared_lstm`` does not go with the other arguments
     :raises TypeError: If a number of units or layers is not an integer
     :raises ValueError: If ``memory`` or ``lstm_kwargs`` is unknown, or a number is below 1
     """

@@ -98,6 +98,9 @@ class Experiment(exp_manager.ExperimentManager):
                     f"There is no trial {self.trial_id} of {self.algo} in a study {self.study_name!r} of "
                     f"{self.storage}: pass another --trial-id, --study-name or --storage"
                 ) from error
+        if self.continue_training:
+            # The model keeps its window, which load cannot replace
+            found.pop("stats_window_size", None)
         replaced = self.custom_hyperparams or {}
         if self.continue_training and (fixed := {"policy", "policy_kwargs", "stats_window_size"} & replaced.keys()):
             raise ConfigurationError(f"--trained-agent keeps the model's {min(fixed)}: leave it out of -params")
@@ -117,9 +120,6 @@ class Experiment(exp_manager.ExperimentManager):
             self.argument_names |= names.keys()
         saved = OrderedDict(sorted(found.items()))
         pprint(saved)
-        if self.continue_training:
-            # load cannot replace it
-            found.pop("stats_window_size", None)
         if found.pop(TRAIN_ENV_KWARGS, None):
             # The Zoo's commands read env_kwargs from the saved settings too, for the environments that they show
             found["env_kwargs"] = {**keywords["env_kwargs"], **keywords[TRAIN_ENV_KWARGS], **self.env_kwargs}

@@ -21,7 +21,7 @@ from sb3_reinforce import REINFORCE, ActionMaskObservation, FiniteDifference
 from sb3_reinforce.common import arguments
 from sb3_reinforce.common.settings import LEARN_ARGUMENTS
 from sb3_reinforce.estimation import BASELINES, ESTIMATORS
-from sb3_reinforce.recurrent import RecurrentREINFORCE
+from sb3_reinforce.recurrent import MaskedLstmPolicy, RecurrentREINFORCE
 
 NAN, INF = float("nan"), float("inf")
 TABLES = {algorithm: algorithm._arguments for algorithm in (REINFORCE, FiniteDifference)}
@@ -166,10 +166,13 @@ RECURRENT, MASKABLE = (
         ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
         ("steps", {"policy": "MlpLstmPolicy"}, ["policy", "MlpLstmPolicy", "RecurrentREINFORCE", "VecFrameStack"]),
         ("search", {"policy": RECURRENT}, ["policy", "RecurrentREINFORCE", "VecFrameStack"]),
-        ("steps", {"policy": "MaskedLstmPolicy"}, ["policy", "MaskedLstmPolicy", "RecurrentREINFORCE"]),
         ("steps", {"policy": MASKABLE}, ["policy", "MaskedPolicy", "ActionMaskObservation"]),
         ("search", {"env": WITH_MASKS, "policy": "MlpPolicy"}, ["got MlpPolicy", "MaskedPolicy"]),
-        ("steps", {"learning_rate": lambda: 1e-3}, ["learning_rate (at progress_remaining=1)", "TypeError"]),
+        (
+            "steps",
+            {"learning_rate": lambda: 1e-3},
+            ["learning_rate (at", "of the remaining progress", "TypeError"],
+        ),
         ("steps", {"n_episodes": 4}, ["n_steps=8", "n_episodes=4"]),
         ("steps", {"gae_lambda": 0.9, "baseline": "mean"}, ["gae_lambda=0.9", "'value'", "'mean'"]),
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
@@ -196,6 +199,13 @@ def test_arguments_that_do_not_go_together(kind, wrong, words):
     with pytest.raises((ValueError, TypeError)) as error:
         make(kind, **wrong)
     assert all(word in str(error.value) for word in words)
+
+
+@both
+@pytest.mark.parametrize("policy", ["MaskedLstmPolicy", MaskedLstmPolicy])
+def test_frames_of_masks_are_not_recommended(kind, policy):
+    with pytest.raises(ValueError, match=r"got MaskedLstmPolicy: .*RecurrentREINFORCE$"):
+        make(kind, policy=policy)
 
 
 def test_of_several_wrong_arguments_the_same_is_named_in_every_process():
