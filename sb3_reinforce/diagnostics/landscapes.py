@@ -53,10 +53,9 @@ class CandidateUtility:
         self.n_steps = 0
         #: A bar of tqdm that counts episodes, or None
         self.bar: Any = None
-        policy = cast(ActorCriticPolicy, model.policy)
-        self.parameters = searched_parameters(policy)
+        self.policy = cast(ActorCriticPolicy, model.policy)
+        self.parameters = searched_parameters(self.policy)
         self.theta = read(self.parameters)
-        self.actor = make_candidate_actor(policy, self.parameters, self.env.num_envs, deterministic=False)
 
     def __call__(self, thetas: th.Tensor) -> th.Tensor:
         """
@@ -70,8 +69,9 @@ class CandidateUtility:
         seeds = seeds_of(thetas.shape, self.n_episodes, self.seed)
         self.seed = int(seeds[-1, -1]) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)
-        with undisturbed(self.model), unclipped(self.env), evaluation_mode(self.model.policy):
-            returns = evaluate_candidates(self.actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
+        actor = make_candidate_actor(self.policy, self.parameters, self.env.num_envs, deterministic=False)
+        with undisturbed(self.model), unclipped(self.env), evaluation_mode(self.policy):
+            returns = evaluate_candidates(actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 
     def _count(self, step: CandidateStep) -> None:

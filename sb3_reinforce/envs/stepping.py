@@ -35,7 +35,8 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
         rewards[i] = reward if isinstance(reward, float) else as_reward(reward, i)
         if not isinstance(info, dict):
             raise BadData(f"The info of environment {i} must be a dict, got {info!r}")
-        info = {key: value if isinstance(value, IMMUTABLE) else deepcopy(value) for key, value in info.items()}
+        # Most infos are empty, and a comprehension takes a call
+        info = copied_info(info) if info else {}
         info["TimeLimit.truncated"] = truncated and not terminated
         if terminated or truncated:
             dones[i] = True
@@ -49,7 +50,13 @@ def step_wait(env: DummyVecEnv) -> VecEnvStepReturn:
             write_observation(env, i, obs)
         infos.append(info)
     env.buf_infos = infos
-    return copy_observations(env), rewards.copy(), dones.copy(), infos.copy()
+    observations = rows.copy() if is_box else copy_observations(env)
+    return observations, rewards.copy(), dones.copy(), infos.copy()
+
+
+def copied_info(info: dict[str, Any]) -> dict[str, Any]:
+    """A copy of an info that later changes of the environment do not reach."""
+    return {key: value if isinstance(value, IMMUTABLE) else deepcopy(value) for key, value in info.items()}
 
 
 def reset(env: DummyVecEnv) -> VecEnvObs:

@@ -19,7 +19,7 @@ from sb3_reinforce.common.tensors import take, to_vector
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.evaluation import distribution_of, extract_features
 from sb3_reinforce.policies.masks import sizes_of
-from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
+from sb3_reinforce.policies.plain_mlp import plain_actor, takes_vectors, temperature_hook
 
 
 class LoopActor:
@@ -72,7 +72,9 @@ class MatrixActor:
         self.deterministic = deterministic
         self.device = policy.device
         self.as_env_actions = env_actions_of(policy)
-        self.head = layers[-1]
+        # Asked once: both take longer than the products
+        self.takes_vectors = takes_vectors(policy, policy.pi_features_extractor)
+        self.temperature = temperature_hook(layers[-1])
 
         def stacked(parameter: th.Tensor) -> th.Tensor:
             """The values for each environment, matrices transposed in memory, which halves the price of a product."""
@@ -91,26 +93,32 @@ class MatrixActor:
         for stack, values in zip(self.stacks, parameters.split(thetas, self.searched), strict=True):
             stack[envs] = values
 
-    @th.no_grad()
     def act(self, obs: Any) -> np.ndarray:
         outputs = self.outputs(obs)
         if self.deterministic:
             actions = mode(outputs, self.policy.action_space)
         else:
-            actions = distribution_of(self.policy, outputs).sample()
+            with th.no_grad():
+                actions = distribution_of(self.policy, outputs).sample()
         shape: Any = self.policy.action_space.shape
         return self.as_env_actions(actions.cpu().numpy().reshape(-1, *shape))
 
     def outputs(self, obs: Any) -> th.Tensor:
         """Means or logits, shape ``(n_envs, n_outputs)``, without a graph, since the stacks require no gradient."""
-        x = extract_features(self.policy, obs_as_tensor(obs, self.device), self.policy.pi_features_extractor)[:, None]
+        obs = obs_as_tensor(obs, self.device)
+        if self.takes_vectors:
+            x = obs.flatten(1).float()
+        else:
+            x = extract_features(self.policy, obs, self.policy.pi_features_extractor)
+        x = x.unsqueeze(1)
         for operation in self.operations:
             if isinstance(operation, tuple):
                 weight, bias = operation
                 x = th.baddbmm(bias, x, weight)
             else:
                 x = operation(x)
-        return apply_temperature(self.head, x)[:, 0]
+        x = x.squeeze(1)
+        return x if self.temperature is None else self.temperature(self.policy.action_net, (), x)
 
 
 # Acts in environment i with the i-th of ``n_envs`` candidates

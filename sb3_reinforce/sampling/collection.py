@@ -83,10 +83,9 @@ def collect(
     them, or ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
-    # For callback=None Stable-Baselines3 installs a no-op, which need not be called
-    is_attached = not (type(callback) is ConvertCallback and callback.callback is None)
+    has_callback = is_attached(callback)
     has_values = calls(policy, "forward", with_critic)
-    actor = actor_of(has_values, is_attached)
+    actor = actor_of(has_values, has_callback)
     as_env_actions = env_actions_of(policy)
     # Row t: which environments start an episode at step t. From row 1 on, it is ``dones`` of the step before
     starts = [cast(Bools, model._last_episode_starts)]
@@ -109,7 +108,7 @@ def collect(
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
         try:
-            if is_attached:
+            if has_callback:
                 callback.update_locals(locals())
                 if not goes_on(callback):
                     return None
@@ -131,19 +130,24 @@ def collect(
                     # Of a dict only what the space has; some VecEnvs write the next one into the same array
                     found = map_parts(lambda _, part: part, new_obs, infos[i]["terminal_observation"])
                     terminal_obs[n_steps - 1, i] = deepcopy(found)
-        if is_attached and not actor.is_current(model.policy):
+        if has_callback and not actor.is_current(model.policy):
             write_log_probs(rollout_buffer, actor, first_row)
             policy = model.policy
-            actor = actor_of(calls(policy, "forward", with_critic), is_attached)
+            actor = actor_of(calls(policy, "forward", with_critic), has_callback)
             # The values of the rows so far came from another policy: they are computed in one batch instead
             has_values = False
             first_row = n_steps
     resize(rollout_buffer, n_steps)
     rollout_buffer.full = True
     rollout_buffer.episode_starts[:] = starts[:-1]
-    if is_attached:
+    if has_callback:
         write_log_probs(rollout_buffer, actor, first_row)
     return np.array(starts[1:]), terminal_obs, has_values
+
+
+def is_attached(callback: BaseCallback) -> bool:
+    """Whether a callback must be called: for ``callback=None`` Stable-Baselines3 installs a no-op."""
+    return not (type(callback) is ConvertCallback and callback.callback is None)
 
 
 def goes_on(callback: BaseCallback) -> bool:

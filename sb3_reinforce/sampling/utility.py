@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_reinforce.estimation.estimators import check_candidates
 from sb3_reinforce.sampling.candidate_actors import LoopActor, make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, columns_of, evaluate_candidates, seeds_of
-from sb3_reinforce.sampling.collection import goes_on
+from sb3_reinforce.sampling.collection import goes_on, is_attached
 from sb3_reinforce.sampling.normalization import ObservationStatistics
 
 
@@ -39,6 +39,7 @@ class EpisodicUtility:
     def __post_init__(self) -> None:
         model = self.model
         self.actor = make_candidate_actor(model.policy, self.searched, model.n_envs, model.deterministic)
+        self.is_attached = is_attached(self.callback)
         self.n_parameters = sum(parameter.numel() for parameter in self.searched)
         if model.verbose >= 1 and model._n_updates == 0 and isinstance(self.actor, LoopActor):
             print(f"{type(model.policy).__name__} is not a plain MLP: candidates act one by one, which is slower")
@@ -76,10 +77,13 @@ class EpisodicUtility:
         if step.finished.any():
             finished = np.flatnonzero(step.finished)
             self.model._update_info_buffer([step.infos[i] for i in finished], step.dones[finished])
+        for each in self.observed:
+            each.update()
+        if not self.is_attached:
+            return
         self.callback.update_locals({"self": self.model, **vars(step)})
         # A callback may save a wrapper, and must find it as the user has set it
         for each in self.observed:
-            each.update()
             each.thaw()
         try:
             go_on = goes_on(self.callback)

@@ -55,6 +55,15 @@ def test_vec_normalize_learns_from_the_original_observations():
     np.testing.assert_allclose(env.obs_rms.var, expected.var, rtol=1e-9)
 
 
+def test_a_search_is_the_same_with_and_without_a_callback():
+    found = []
+    for callback in (None, lambda *_: True):
+        env = VecNormalize(make_vec_env("CartPole-v1", 2, seed=0))
+        theta = make(env).learn(60, callback).theta
+        found.append([theta.tolist(), env.obs_rms.mean.tolist(), env.obs_rms.var.tolist(), env.obs_rms.count])
+    assert found[0] == found[1]
+
+
 def test_a_callback_may_stop_the_statistics_of_vec_normalize():
     env = VecNormalize(make_vec_env("CartPole-v1", 2))
     make(env).learn(60, At(3, lambda model: setattr(env, "training", False)))
