@@ -59,8 +59,10 @@ def test_a_search_is_the_same_with_and_without_a_callback():
     found = []
     for callback in (None, lambda *_: True):
         env = VecNormalize(make_vec_env("CartPole-v1", 2, seed=0))
-        theta = make(env).learn(60, callback).theta
-        found.append([theta.tolist(), env.obs_rms.mean.tolist(), env.obs_rms.var.tolist(), env.obs_rms.count])
+        model = make(env).learn(60, callback)
+        moments = env.obs_rms.mean.tolist(), env.obs_rms.var.tolist(), env.obs_rms.count
+        lengths = [info["l"] for info in model.ep_info_buffer]
+        found.append([model.theta.tolist(), moments, lengths, model.num_timesteps, env.training])
     assert found[0] == found[1]
 
 

@@ -22,6 +22,7 @@ from sb3_reinforce.diagnostics.estimator_comparison import likelihood_ratio
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility, filter_normalized
 from sb3_reinforce.diagnostics.tables import Estimate, Table
 from sb3_reinforce.estimation.perturbations import default_delta_std
+from sb3_reinforce.policies.evaluation import set_temperature
 
 
 def bandit(algorithm=REINFORCE, n_envs=8, **kwargs):
@@ -30,10 +31,12 @@ def bandit(algorithm=REINFORCE, n_envs=8, **kwargs):
     return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu", seed=0, **kwargs)
 
 
-def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature():
+@pytest.mark.parametrize("is_later", [False, True])
+def test_the_utility_is_that_of_the_sampling_policy_at_its_temperature(is_later):
     temperature = 0.2
-    model = bandit(n_envs=40, temperature=temperature)
+    model = bandit(n_envs=40, temperature=1.0 if is_later else temperature)
     utility = CandidateUtility(model, 1000, seed=0)
+    set_temperature(model.policy, temperature)
     thetas = utility.theta + th.tensor([0.0, 1.0, -1.0])[:, None] * th.tensor([0.0, 0.0, 0.0, 2.0 * temperature])
     with th.no_grad():
         expected = float(model.policy.get_distribution(th.ones(1, 1)).distribution.logits.diff())

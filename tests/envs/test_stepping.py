@@ -87,6 +87,23 @@ def test_it_returns_what_step_returns_and_that_stays_as_it_was(space):
     assert sum(dones.sum() for (_, _, dones, _), _ in returned) > 50
 
 
+class Wordless(Drawn):
+    """All infos are one dict, which is empty."""
+
+    own = {}  # noqa: RUF012
+
+    def step(self, action):
+        return *super().step(action)[:4], self.own
+
+
+def test_an_empty_info_of_the_environment_stays_empty():
+    env = DummyVecEnv([lambda: Wordless("box")])
+    with guard(env):
+        env.reset()
+        infos = [env.step(np.zeros((1, 2)))[3][0] for _ in range(20)]
+    assert Wordless.own == {} and len({*map(id, infos)}) == 20
+
+
 class Silent(Drawn):
     """Returns None for the info of a step."""
 

@@ -232,7 +232,7 @@ SETTINGS = [
     ("baseline: mean, gae_lambda: 0.9", "reward_to_go=True (settings that -params does not give are from "),
     ("gamma: 3", "gamma must be in [0, 1], got 3"),
     ("gamma: x", "gamma must be a number, got 'x' of type str"),
-    ("policy_kwargs: 'dict('", "must be Python, but 'dict(' raises SyntaxError"),
+    ("policy_kwargs: 'dict('", "must be Python that the Zoo can evaluate, but 'dict(' raises SyntaxError"),
     ("policy_kwargs: [1]", "policy_kwargs must be a dict"),
     ("policy_kwargs: {net: [5]}", "unexpected keyword argument 'net'"),
     ("policy: LinearPolicy, policy_kwargs: {net_arch: [5]}", "has no hidden layers"),
