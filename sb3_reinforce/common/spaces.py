@@ -55,7 +55,7 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
 
 
 def check_dicts(policy: str | type, space: spaces.Space[Any]) -> None:
-    """Name the policies for observations in dicts, of which Stable-Baselines3 knows one, which enforces no masks."""
+    """Refuse policies that need flat observations: the error of Stable-Baselines3 does not name MaskedPolicy."""
     if isinstance(space, spaces.Dict) and policy in ("MlpPolicy", "CnnPolicy"):
         allowed = "MultiInputPolicy, or MaskedPolicy for action masks,"
         raise ValueError(f"policy must be {allowed} for observations in {space}, got {policy}")
