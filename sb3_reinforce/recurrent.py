@@ -19,7 +19,7 @@ from sb3_reinforce.policies.critic import next_values_of
 from sb3_reinforce.policies.recurrent import CnnLstmPolicy, MaskedLstmPolicy, MlpLstmPolicy, MultiInputLstmPolicy
 from sb3_reinforce.policies.sequences import RecurrentPolicy, rows_of
 from sb3_reinforce.reinforce import REINFORCE
-from sb3_reinforce.sampling.columns import Columns
+from sb3_reinforce.sampling.collection import Columns
 from sb3_reinforce.sampling.recurrent_actors import RecurrentActor, make_recurrent_actor
 
 __all__ = ["CnnLstmPolicy", "MaskedLstmPolicy", "MlpLstmPolicy", "MultiInputLstmPolicy", "RecurrentREINFORCE"]
@@ -182,9 +182,7 @@ class RecurrentREINFORCE(REINFORCE):
         return state
 
     @th.no_grad()
-    def _evaluate_critic(
-        self, has_values: bool, buffer: RolloutBuffer, columns: Columns
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(self, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
         policy = self.policy
         dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state

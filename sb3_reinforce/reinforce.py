@@ -1,6 +1,7 @@
 """REINFORCE as an algorithm of Stable-Baselines3."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -52,8 +53,15 @@ from sb3_reinforce.policies.masks import MaskedPolicy
 from sb3_reinforce.policies.natural import DEFAULT_TARGET_KL, check_distribution, natural_step
 from sb3_reinforce.policies.plain_mlp import plain_actor
 from sb3_reinforce.sampling.actors import Actor, make_actor
-from sb3_reinforce.sampling.collection import Extent, check_rollout_data, collect, keep_fractions, warn_of_own_methods
-from sb3_reinforce.sampling.columns import Columns, gather
+from sb3_reinforce.sampling.collection import (
+    Columns,
+    Extent,
+    check_rollout_data,
+    collect,
+    keep_fractions,
+    warn_of_own_methods,
+)
+from sb3_reinforce.sampling.columns import gather
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -67,13 +75,13 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
     (Williams, 1992, section 5 and theorem 2, for the total return; Sutton et al., 2000, for G_t; γ^t only with
-    ``discount_scores``). m_t is 1 for used steps and 0 for the others. Used steps have a known return and, with
-    ``n_episodes``, belong to an episode that counts. The denominator is ``n_steps * n_envs`` for fixed rollouts; for
-    whole episodes see ``normalize_by``. E[ĝ] is exactly ∇θ E[G_0] with ``n_episodes``, ``normalize_by="episodes"``,
-    ``discount_scores=True``, ``ent_coef=0``, the baseline ``"none"``, ``"leave_one_out"`` or ``"optimal"``, and without
-    ``normalize_advantage`` and clipping. gSDE is an exception: its steps share noise, and Stable-Baselines3 cuts the
-    gradient where the noise depends on the features. So are dropout, batch normalization and noisy layers, with which
-    the policy that is trained is not the one that acts, as in A2C.
+    ``discount_scores`` and ``reward_to_go``). m_t is 1 for used steps and 0 for the others. Used steps have a known
+    return and, with ``n_episodes``, belong to an episode that counts. The denominator is ``n_steps * n_envs`` for fixed
+    rollouts; for whole episodes see ``normalize_by``. E[ĝ] is exactly ∇θ E[G_0] with ``n_episodes``,
+    ``normalize_by="episodes"``, ``discount_scores=True``, ``ent_coef=0``, the baseline ``"none"``, ``"leave_one_out"``
+    or ``"optimal"``, and without ``normalize_advantage`` and clipping. gSDE is an exception: its steps share noise, and
+    Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout, batch normalization and
+    noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -344,15 +352,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             collected = collect(self, env, callback, rollout_buffer, extent, self.has_critic, self._make_actor)
             if collected is None:
                 return False
-            # Not named dones, which in a callback's locals are those of the last step, as with A2C
-            all_dones, terminal_obs, has_values = collected
-            check_rollout_data(rollout_buffer, self._last_obs, terminal_obs)
-            own = Columns(all_dones, terminal_obs, self._last_obs, extent.quota, self._state)
-            columns = gather(self, rollout_buffer, own)
+            check_rollout_data(rollout_buffer, self._last_obs, collected.terminal_obs)
+            columns = gather(self, rollout_buffer, replace(collected, state=self._state))
             if columns is not None:
-                self.rollout = self._complete(
-                    rollout_buffer, columns, has_values, baseline, n_rollout_steps is not None
-                )
+                self.rollout = self._complete(rollout_buffer, columns, baseline, n_rollout_steps is not None)
             is_collected = True
         except Exception:
             # The cause may be a number that is not finite: then that is reported instead
@@ -386,14 +389,12 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
             return
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
-    def _complete(
-        self, buffer: RolloutBuffer, columns: Columns, has_values: bool, baseline: Baseline, is_fixed: bool
-    ) -> Rollout:
+    def _complete(self, buffer: RolloutBuffer, columns: Columns, baseline: Baseline, is_fixed: bool) -> Rollout:
         """The rollout with the weights of its steps, which the buffer gets too."""
         self._running = self._running.restarted(where=buffer.episode_starts[0].astype(bool))
         next_values = None
         if baseline is BASELINES["value"]:
-            buffer.values, next_values = self._evaluate_critic(has_values, buffer, columns)
+            buffer.values, next_values = self._evaluate_critic(buffer, columns)
         rollout, buffer.advantages, buffer.returns = complete_rollout(
             buffer,
             self.policy,
@@ -423,11 +424,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def _make_actor(self, calls_forward: bool, with_log_prob: bool) -> Actor:
         return make_actor(self.policy, calls_forward, self.n_envs, with_log_prob)
 
-    def _evaluate_critic(
-        self, has_values: bool, buffer: RolloutBuffer, columns: Columns
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_critic(self, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}), both of shape ``(n_steps, n_envs)``."""
-        return rollout_values(self.policy, has_values, buffer, columns.dones, columns.last_obs, columns.terminal_obs)
+        return rollout_values(
+            self.policy, columns.has_values, buffer, columns.dones, columns.last_obs, columns.terminal_obs
+        )
 
     @uninterrupted
     def train(self) -> None:
@@ -514,7 +515,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.policy.share_features_extractor:
             self.policy.features_extractor.eval()
         update_learning_rate(self.critic_optimizer, rate)
-        value_loss = float(F.mse_loss(values, batch.returns.to(values)))
+        value_loss = float(F.mse_loss(values, batch.returns.cpu().to(values)))
         if critic:
             value_loss = fit_critic(
                 self.policy,

@@ -54,7 +54,7 @@ ELSEWHERE = {
     r"-m venv|pip install|activate$": "`.ci/run` installs by the README's lines; the extras are looked up below",
     r"-m pytest$|make (check|docs|examples|wheel)$|^\.ci/run$|/1_reinforce\.py$": "`.ci/run` does it",
     r"compare(_plots)?\.py": "tests/zoo/test_compare.py runs both scripts",
-    r"-optimize|--trial-id|-f agents$|train --help$": "tests/zoo runs these commands with other settings and folders",
+    r"-optimize|--trial-id|-f agents$|zoo\.model_card|train --help$": "tests/zoo runs them with other settings",
     r"^make agents$": "minutes; tests/zoo/test_zoo.py runs its two commands",
     r"torch\.distributed\.run": "tests/common/test_process_ends.py and tests/zoo/test_zoo_processes.py start it",
     r"processes\.py": "minutes: it starts eight processes for each row",

@@ -4,7 +4,6 @@ import difflib
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from inspect import Parameter, signature
 from numbers import Integral, Real
 from typing import Any, TypeAlias
@@ -138,12 +137,7 @@ class CheckedSchedule(FloatSchedule):
 
 def optional(check: Check) -> Check:
     """Let a check pass None."""
-    return partial(check_unless_none, check=check)
-
-
-def check_unless_none(name: str, value: Any, check: Check) -> Any:
-    """Check a value that may also be None."""
-    return None if value is None else check(name, value)
+    return lambda name, value: None if value is None else check(name, value)
 
 
 def own_arguments(cls: type, base: type) -> dict[str, Parameter]:

@@ -14,7 +14,7 @@ from sb3_reinforce.common.arguments import (
     check_integer,
     check_kind,
     check_number,
-    check_unless_none,
+    optional,
 )
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
@@ -114,8 +114,8 @@ def compare_estimators(
     check_integer("n_resamples", n_resamples, 1)
     seed = check_integer("seed", seed, 0)
     check_number("confidence", confidence, 0, 1)
-    check_unless_none("n_delta", n_delta, partial(check_integer, low=2))
-    check_unless_none("delta_std", delta_std, partial(check_number, low=0, above=True))
+    optional(partial(check_integer, low=2))("n_delta", n_delta)
+    optional(partial(check_number, low=0, above=True))("delta_std", delta_std)
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
     utility = CandidateUtility(model, 1, seed)
     n_parameters = len(utility.theta)
@@ -182,7 +182,13 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     weights = rollout.returns - baselines.leave_one_out(rollout)
     gradients = gradients_by_episode(rollout, weights)[0].double().cpu()
     wanted = {*searched_parameters(rollout.policy)}
-    mask = th.cat([th.full((parameter.numel(),), parameter in wanted) for parameter in parameters_of(rollout)])
+    differentiated = parameters_of(rollout)
+    if not wanted <= {*differentiated}:
+        raise ValueError(
+            f"log π of {type(rollout.policy).__name__} must have derivatives for all parameters that are searched, to "
+            "compare REINFORCE with finite differences"
+        )
+    mask = th.cat([th.full((parameter.numel(),), parameter in wanted) for parameter in differentiated])
     return gradients[:, mask], rollout.dones.numel()
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.arguments import check_flag, check_integer, check_kind
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.weights import by_step, compute_weights
+from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.policies.evaluation import evaluation_mode
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
@@ -111,9 +111,9 @@ def env_of(model: BaseAlgorithm) -> VecEnv:
 def training_weights(model: REINFORCE) -> th.Tensor:
     """γ^t (G_t − b_t) of ``train()``, normalized if the model does so, shape ``(n_steps, n_envs)``, float64."""
     rollout = cast(Rollout, model.rollout)
-    advantages, _ = by_step(model.rollout_buffer)
+    batch = training_batch(rollout, model.rollout_buffer, model.normalize_advantage)
     weights = th.zeros_like(rollout.returns)
-    weights[rollout.used] = compute_weights(rollout, advantages, model.normalize_advantage).to(weights)
+    weights[rollout.used] = batch.weights.to(weights)
     return weights
 
 

@@ -92,11 +92,11 @@ def optimal(rollout: Rollout) -> th.Tensor:
     """
     ``b_i = Σ_{j≠i} ⟨A_j, S_j⟩ / Σ_{j≠i} ‖S_j‖²`` for all steps of episode i, and 0 where the other scores vanish.
 
-    ``S_j = Σ_t γ^t ∇log π(a_t|s_t)`` is the score of episode j and ``A_j = Σ_t γ^t ∇log π(a_t|s_t) G_t``, without γ^t
-    unless ``discount_scores``. A constant b leaves the trace of the covariance of A − b S as
-    E‖A‖² − 2b E⟨A, S⟩ + b² E‖S‖² + const, since E[S] = 0; this b minimizes it. For the total return it is the mean of
-    G_0 weighted by ‖S_j‖² (Greensmith, Bartlett and Baxter, 2004; for each component: Peters and Schaal, 2008, section
-    3.2). Unbiased, because the sums leave out the episode that b is applied to.
+    ``S_j = Σ_t γ^t ∇log π(a_t|s_t)`` is the score of episode j and ``A_j = Σ_t γ^t ∇log π(a_t|s_t) G_t``, with γ^t only
+    as in the gradient (``Rollout.discounts``). A constant b leaves the trace of the covariance of A − b S as E‖A‖² − 2b
+    E⟨A, S⟩ + b² E‖S‖² + const, since E[S] = 0; this b minimizes it. For the total return it is the mean of G_0 weighted
+    by ‖S_j‖² (Greensmith, Bartlett and Baxter, 2004; for each component: Peters and Schaal, 2008, section 3.2).
+    Unbiased, because the sums leave out the episode that b is applied to.
 
     :param rollout: The rollout
     :return: b_t, shape ``(n_steps, n_envs)``, float64

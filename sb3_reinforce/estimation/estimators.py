@@ -221,7 +221,7 @@ def check_candidates(must: str, candidates: Any, n_parameters: int) -> th.Tensor
     if not is_shaped or not candidates.isfinite().all():
         got = f"shape {shape}: {candidates}" if isinstance(candidates, th.Tensor) else f"{candidates!r}"
         raise ValueError(f"{must} a finite tensor of shape (k, {n_parameters}) or (m, k, {n_parameters}), got {got}")
-    result: th.Tensor = candidates.detach().to("cpu", th.float64)
+    result: th.Tensor = candidates.detach().cpu().double()
     return result
 
 
@@ -232,4 +232,4 @@ def check_tensor(name: str, value: Any, shape: tuple[int, ...]) -> th.Tensor:
         raise ValueError(f"{name} must return a tensor of shape {tuple(shape)}, got {got}")
     if not value.isfinite().all():
         raise ValueError(f"{name} must return finite numbers, got {value}")
-    return value.detach().to("cpu", th.float64)
+    return value.detach().cpu().double()

@@ -78,6 +78,10 @@ def used_steps(dones: Bools, quota: Integers | None, normalize_by: str, has_crit
     """m_t, which is 1 where G_t is known and the step is in the quota, and the denominator D."""
     used = np.ones_like(dones) if has_critic else in_finished_episode(dones)
     if quota is None:
+        if normalize_by == "episodes":
+            warnings.warn(
+                "normalize_by='episodes' has no effect with n_steps: set n_episodes for whole episodes", stacklevel=2
+            )
         check_used(used)
         return used, used.size
     used = used & within_quota(dones, quota)
@@ -100,7 +104,7 @@ def without_rounding(differences: th.Tensor, numbers: th.Tensor) -> th.Tensor:
 
 
 def compute_weights(rollout: Rollout, advantages: Floats, normalize: bool) -> th.Tensor:
-    """``γ^t (G_t − b_t)`` of the n used steps, shape ``(n,)``, float32; γ^t only with ``discount_scores``."""
+    """``γ^t (G_t − b_t)`` of the n used steps, shape ``(n,)``, float32; γ^t only if the rollout has it."""
     device = rollout.actions.device
     weights: th.Tensor = select(th.as_tensor(advantages, device=device), rollout.used)
     if normalize:

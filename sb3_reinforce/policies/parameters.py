@@ -1,5 +1,6 @@
 """θ, the parameters of a policy's actor, as one vector of float64, which holds every float32 exactly."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -13,11 +14,22 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
-from sb3_reinforce.policies.evaluation import actor_parameters, evaluation_mode, leave_no_graph
+from sb3_reinforce.policies.evaluation import (
+    Parameters,
+    actor_parameters,
+    critic_parameters,
+    evaluation_mode,
+    leave_no_graph,
+    trainable,
+)
 
 
-def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
-    """The trainable parameters that log π depends on, in the policy's order, without ``log_std``."""
+def searched_parameters(policy: ActorCriticPolicy) -> Parameters:
+    """
+    The trainable parameters in the policy's order, without ``log_std`` and without those that V alone depends on.
+
+    A parameter that neither has a derivative for is searched, with a warning: it may come before a threshold.
+    """
     # The memory of this package's recurrent policies and of sb3-contrib's
     if hasattr(policy, "lstm_actor"):
         raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
@@ -25,10 +37,20 @@ def searched_parameters(policy: ActorCriticPolicy) -> list[th.nn.Parameter]:
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
     with evaluation_mode(policy), th.enable_grad():
-        parameters = actor_parameters(policy, obs, actions)
+        of_actor = {*actor_parameters(policy, obs, actions)}
+        of_critic = {*critic_parameters(policy, obs, actions)}
         leave_no_graph(policy, obs, actions)
-    log_std = getattr(policy, "log_std", None)
-    searched = [parameter for parameter in parameters if parameter is not log_std]
+    left_out = {getattr(policy, "log_std", None), *(of_critic - of_actor)}
+    searched = [parameter for parameter in trainable(policy) if parameter not in left_out]
+    unreached = {parameter for parameter in searched if parameter not in of_actor}
+    if unreached:
+        name = next(name for name, parameter in policy.named_parameters() if parameter in unreached)
+        warnings.warn(
+            f"Neither log π nor V of {type(policy).__name__} has a derivative for {len(unreached)} of its parameters "
+            f"(the first is {name}). They are searched too: call requires_grad_(False) on those that do not change "
+            "actions",
+            stacklevel=2,
+        )
     if not searched:
         raise ValueError(
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"
@@ -46,7 +68,7 @@ def observation_in(space: spaces.Space[Any]) -> Any:
 
 def read(parameters: Sequence[th.Tensor]) -> th.Tensor:
     """θ, a copy of the parameters, shape ``(n,)``, on the CPU."""
-    return to_vector(parameters).to("cpu", th.float64)
+    return to_vector(parameters).cpu().double()
 
 
 def split(thetas: th.Tensor, parameters: Sequence[th.Tensor]) -> list[th.Tensor]:

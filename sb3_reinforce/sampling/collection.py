@@ -3,9 +3,11 @@
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
@@ -16,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_reinforce.common.spaces import env_actions_of
 from sb3_reinforce.common.tensors import map_parts
 from sb3_reinforce.envs.checks import check_finite, check_length
-from sb3_reinforce.estimation.returns import Bools
+from sb3_reinforce.estimation.returns import Bools, Integers
 from sb3_reinforce.policies.evaluation import calls
 from sb3_reinforce.sampling.actors import Actor, NumpyActor
 
@@ -27,11 +29,28 @@ TerminalObs: TypeAlias = dict[tuple[int, int], Any]
 ROWS = ("observations", "actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
 
+@dataclass(frozen=True)
+class Columns:
+    """
+    What was collected besides the rows of the buffer; ``dones`` is of shape ``(n_steps, n_envs)``.
+
+    ``quota`` is the number of episodes that count in each environment, ``has_values`` whether the buffer has V(s_t);
+    ``state`` is as in ``Rollout``.
+    """
+
+    dones: Bools
+    terminal_obs: TerminalObs
+    last_obs: Any
+    quota: Integers
+    state: th.Tensor | None = None
+    has_values: bool = False
+
+
 class Extent:
     """
     When a rollout is complete: after ``n_steps`` per environment, or with ``quota`` episodes of each environment.
 
-    An episode that is waited for and lasts longer than ``max_episode_steps`` counts as one that never ends.
+    An episode that is waited for and lasts longer than ``max_episode_steps`` is an error.
     """
 
     def __init__(self, quota: NDArray[np.integer], n_steps: float = np.inf, max_episode_steps: float = np.inf):
@@ -74,13 +93,12 @@ def collect(
     extent: Extent,
     with_critic: bool,
     actor_of: Callable[[bool, bool], Actor],
-) -> tuple[Bools, TerminalObs, bool] | None:
+) -> Columns | None:
     """
     Step the environments and write what happens into a rollout buffer, which ends with one row per step.
 
-    Returns ``dones`` of shape ``(n_steps, n_envs)``, the terminal observations at time limits and whether the buffer
-    has the values, or None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read
-    them, or ``forward`` returns them with the actions: training has no use for them.
+    Returns None if the callback stopped the collection. The ``log_probs`` are 0 unless a callback can read them, or
+    ``forward`` returns them with the actions: training has no use for them.
     """
     policy = model.policy
     has_callback = is_attached(callback)
@@ -101,7 +119,10 @@ def collect(
         if model.use_sde and model.sde_sample_freq > 0 and n_steps % model.sde_sample_freq == 0:
             policy.reset_noise(env.num_envs)
         actions, values, log_probs = actor.act(model._last_obs)
-        write_step(rollout_buffer, n_steps, model._last_obs, actions, values, log_probs)
+        write_row(rollout_buffer.observations, n_steps, model._last_obs)
+        write_row(rollout_buffer.actions, n_steps, actions)
+        write_row(rollout_buffer.values, n_steps, values)
+        write_row(rollout_buffer.log_probs, n_steps, log_probs)
         # The environment would be blamed for what it does with NaN
         check_finite("The policy's action", actions, (None,))
         clipped_actions = as_env_actions(actions)
@@ -142,7 +163,7 @@ def collect(
     rollout_buffer.episode_starts[:] = starts[:-1]
     if has_callback:
         write_log_probs(rollout_buffer, actor, first_row)
-    return np.array(starts[1:]), terminal_obs, has_values
+    return Columns(np.array(starts[1:]), terminal_obs, model._last_obs, extent.quota, has_values=has_values)
 
 
 def is_attached(callback: BaseCallback) -> bool:
@@ -169,16 +190,6 @@ def keep_fractions(buffer: RolloutBuffer, obs: Any, action_space: spaces.Space[A
     buffer.observations = map_parts(fitted, buffer.observations, obs)
     if isinstance(action_space, spaces.Box):
         buffer.actions = fitted(buffer.actions, 0.0)
-
-
-def write_step(
-    buffer: RolloutBuffer, step: int, obs: Any, actions: Any, values: np.ndarray | None, log_probs: np.ndarray | None
-) -> None:
-    """Write what is known before the environments step."""
-    write_row(buffer.observations, step, obs)
-    write_row(buffer.actions, step, actions)
-    write_row(buffer.values, step, values)
-    write_row(buffer.log_probs, step, log_probs)
 
 
 def write_row(rows: Any, step: int, values: Any) -> None:

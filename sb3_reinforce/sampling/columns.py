@@ -1,7 +1,7 @@
 """The columns of a rollout, one per environment, which several processes may have collected."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,23 +9,7 @@ import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_reinforce.common.tensors import map_parts
-from sb3_reinforce.estimation.returns import Bools, Integers
-from sb3_reinforce.sampling.collection import ROWS, TerminalObs
-
-
-@dataclass(frozen=True)
-class Columns:
-    """
-    What was collected besides the rows of the buffer; ``dones`` is of shape ``(n_steps, n_envs)``.
-
-    ``quota`` is the number of episodes that count in each environment; ``state`` is as in ``Rollout``.
-    """
-
-    dones: Bools
-    terminal_obs: TerminalObs
-    last_obs: Any
-    quota: Integers
-    state: th.Tensor | None = None
+from sb3_reinforce.sampling.collection import ROWS, Columns
 
 
 def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | None:
@@ -40,7 +24,7 @@ def gather(model: Any, buffer: RolloutBuffer, columns: Columns) -> Columns | Non
 def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]], device: Any = "cpu") -> Columns:
     """Write the parts side by side into the buffer, as one process would with the environments of all."""
     all_columns = [columns for columns, _ in parts]
-    # A process without a quota has rows up to the first end of an episode, and none of them counts
+    # A process without a quota has steps until an episode ends, and none of them counts
     n_steps = max(len(columns.dones) for columns in all_columns if columns.quota.any())
     for name in ROWS:
         # A policy may refuse observations of zeros
@@ -69,6 +53,8 @@ def join(buffer: RolloutBuffer, parts: Sequence[tuple[Columns, dict[str, Any]]],
         last_obs=map_parts(lambda *parts: np.concatenate(parts), *(columns.last_obs for columns in all_columns)),
         quota=np.concatenate([columns.quota for columns in all_columns]),
         state=state,
+        # A callback of process 0 may have changed its policy alone
+        has_values=all(columns.has_values for columns in all_columns),
     )
 
 

@@ -28,7 +28,7 @@ SCRIPTS = ("record_video", "benchmark")
 COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 NOT_OFFERED = {
     "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
-    "load_from_hub": "it only downloads the Zoo's own models: python -m rl_zoo3.load_from_hub",
+    "load_from_hub": "it does not know these algorithms; for the Zoo's own: python -m rl_zoo3.load_from_hub",
     "record_training": "record the checkpoints one by one: record_video --load-checkpoint STEPS",
 }
 
@@ -99,6 +99,7 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         known.add_argument(name)
     known.add_argument("-f", "--folder", default="rl-trained-agents")
     known.add_argument("-i", "--trained-agent")
+    known.add_argument("-optimize", "--optimize", "--optimize-hyperparameters", dest="optimizes", action="store_true")
     for name in ("--load-best", "--load-last-checkpoint"):
         known.add_argument(name, action="store_true")
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
@@ -122,6 +123,10 @@ def check(parser: argparse.ArgumentParser, command: str, arguments: list[str]) -
         return
     if given.trial_id and not (given.storage and given.study_name):
         parser.error("--trial-id needs --storage and --study-name: without them the Zoo ignores it")
+    if (given.storage or given.study_name) and not (given.trial_id or given.optimizes):
+        parser.error("--storage and --study-name need -optimize or --trial-id: without them the Zoo ignores both")
+    if given.trained_agent and given.optimizes:
+        parser.error("--trained-agent cannot be tuned: with it the Zoo ignores -optimize")
     if given.trained_agent and not (given.trained_agent.endswith(".zip") and os.path.isfile(given.trained_agent)):
         parser.error(f"--trained-agent {given.trained_agent} is not the .zip file of a model")
 

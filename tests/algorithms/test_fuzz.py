@@ -154,6 +154,7 @@ def assert_trains(algorithm, env, arguments):
     model = algorithm(policy, env, device="cpu", policy_kwargs={"net_arch": [4]}, **arguments)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Episodes that n_steps cuts are left out")
+        warnings.filterwarnings("ignore", "normalize_by='episodes' has no effect")
         warnings.filterwarnings("ignore", "n_delta=. perturbations do not determine")
         warnings.filterwarnings("ignore", "The natural step is left out")
         model.learn(30, Counts())

@@ -154,6 +154,7 @@ def assert_step_is(model, before, expected, scale):
 
 
 @pytest.mark.filterwarnings("ignore:Episodes that n_steps cuts")
+@pytest.mark.filterwarnings("ignore:normalize_by='episodes' has no effect")
 @pytest.mark.parametrize("n_envs", [1, 4])
 @pytest.mark.parametrize("truncate", [False, True])
 @pytest.mark.parametrize("reward_to_go", [False, True])

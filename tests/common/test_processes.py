@@ -17,11 +17,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import FiniteDifference
 from sb3_reinforce.common.moments import seen_since
+from sb3_reinforce.common.tensors import flatten
 from sb3_reinforce.estimation import BASELINES
 from sb3_reinforce.policies.evaluation import temperature_of
 from sb3_reinforce.recurrent import RecurrentREINFORCE
-from sb3_reinforce.sampling.collection import ROWS
-from sb3_reinforce.sampling.columns import Columns, join
+from sb3_reinforce.sampling.collection import ROWS, Columns
+from sb3_reinforce.sampling.columns import join
 
 SEARCHES = {
     "central": {"estimator": "central", "n_delta": 3},
@@ -273,6 +274,20 @@ def test_after_common_starts_the_environments_of_all_processes_are_independent(t
 def test_whole_episodes_begin_with_a_reset_in_all_processes(tmp_path):
     observations, _ = in_processes(2, observations_of_all, tmp_path)
     assert observations == [[0, 1, 2], [0, 1, 2]]
+
+
+def values_with_a_hook(rank):
+    """V in process 0, whose policy a callback has given a hook, and what it should be."""
+    model = make("steps", corridors(2), n_steps=3, learning_rate=0.0)
+    model.learn(1, Record(lambda model: model.policy.register_forward_hook(lambda *_: None), "rollout_start"))
+    rollout = model.rollout
+    if rank == 0:
+        return rollout.values.flatten().tolist(), model.policy.predict_values(flatten(rollout.observations)).tolist()
+
+
+def test_values_of_all_columns_are_known_where_only_process_0_calls_forward(tmp_path):
+    (values, expected), _ = in_processes(2, values_with_a_hook, tmp_path)
+    assert np.allclose(values, np.ravel(expected))
 
 
 def returns_in_window(rank):

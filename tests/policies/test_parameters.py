@@ -38,6 +38,35 @@ def test_a_shared_features_extractor_is_part_of_the_actor() -> None:
     assert not any("value" in name for name in names(policy))
 
 
+class Threshold(th.nn.Module):
+    """An activation without a derivative."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return (x > 0).float()
+
+
+class NoGradient(ActorCriticPolicy):
+    """A policy whose log π has no derivative at all."""
+
+    def get_distribution(self, obs):
+        with th.no_grad():
+            return super().get_distribution(obs)
+
+
+@pytest.mark.parametrize("policy_class, activation", [(ActorCriticPolicy, Threshold), (NoGradient, th.nn.Tanh)])
+def test_a_policy_without_derivatives_is_searched(policy_class: type[ActorCriticPolicy], activation: type) -> None:
+    kwargs = {"net_arch": [4], "activation_fn": activation}
+    layers = ("mlp_extractor.policy_net.0", "action_net")
+    with pytest.warns(UserWarning, match=r" of its parameters \(the first is mlp_extractor.policy_net.0.weight\)"):
+        model = FiniteDifference(policy_class, "CartPole-v1", estimator="central", seed=0, policy_kwargs=kwargs)
+        model.policy.mlp_extractor.value_net.requires_grad_(False)
+        hidden = model.policy.mlp_extractor.policy_net[0].weight
+        before = hidden.detach().clone()
+        model.learn(1)
+        assert names(model.policy) == {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+    assert not th.equal(hidden, before)
+
+
 def test_read_and_write_are_an_exact_round_trip() -> None:
     policy = make(ActorCriticPolicy)
     actor = parameters.searched_parameters(policy)

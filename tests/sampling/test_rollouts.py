@@ -72,6 +72,13 @@ def test_a_cut_episode_without_a_critic_is_left_out_with_a_warning():
     assert model.logger.name_to_value["rollout/complete_fraction"] == 0.8
 
 
+def test_a_denominator_of_episodes_is_for_whole_episodes():
+    model = make_model(lambda: Corridor((4,)), 1, n_steps=8, normalize_by="episodes")
+    with pytest.warns(UserWarning, match="set n_episodes"):
+        model.learn(8)
+    assert model.rollout.denominator == 8
+
+
 def test_the_fraction_of_complete_steps_is_logged_with_a_critic_too():
     model = make_model(lambda: Corridor((4,)), 1, n_steps=10).learn(10)
     assert model.rollout.used.all() and model.logger.name_to_value["rollout/complete_fraction"] == 0.8

@@ -316,6 +316,8 @@ def test_an_error_that_is_not_of_the_configuration_stays_one(error, tmp_path, mo
         (["train", "-params", "n_steps:1/0"], "the value of 'n_steps:1/0' must be Python (ZeroDivisionError"),
         (["train", "-params", "gamma:0.9", "n_steps=5"], "'n_steps=5' must be KEY:VALUE"),
         (["train", "--trial-id", "1"], "--trial-id needs --storage and --study-name"),
+        (["train", "--study-name", "x"], "--storage and --study-name need -optimize or --trial-id"),
+        (["train", "-i", "a.zip", "-optimize"], "--trained-agent cannot be tuned"),
         (["train", "-i", "nowhere.zip"], "--trained-agent nowhere.zip is not the .zip file of a model"),
         (["train", "--gym-packages", "nope_pkg"], "No module named 'nope_pkg': install it"),
         ([*REINFORCE, "-params", "env_wrapper:'nope_pkg.Wrapper'"], "No module named 'nope_pkg': install it"),
