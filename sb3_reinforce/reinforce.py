@@ -85,8 +85,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
-    left out, since its return is not known. Without a critic only policies with hooks, or with their own ``forward``,
-    ``evaluate_actions`` or ``extract_features``, evaluate the value network.
+    left out, since its return is not known. Without a critic the value network is evaluated only in policies with
+    hooks, or with their own ``forward``, ``evaluate_actions`` or ``extract_features``.
 
     The critic has a separate optimizer of the policy's ``optimizer_class``, for the parameters that only V depends on.
     A features extractor that actor and critic share (the default of CnnPolicy) is not trained by the critic's passes,

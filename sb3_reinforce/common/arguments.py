@@ -4,6 +4,7 @@ import difflib
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from inspect import Parameter, signature
 from numbers import Integral, Real
 from typing import Any, TypeAlias
@@ -103,7 +104,7 @@ class CheckedSchedule(FloatSchedule):
     """
     A number ≥ 0, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    With ``above`` a value may be 0 only at the end of training, or with ``may_reach_zero`` anywhere after its start.
+    With ``above`` a value may be 0 only at the end of training; with ``may_reach_zero`` too, anywhere after the start.
     """
 
     def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach_zero: bool = False):
@@ -137,7 +138,12 @@ class CheckedSchedule(FloatSchedule):
 
 def optional(check: Check) -> Check:
     """Let a check pass None."""
-    return lambda name, value: None if value is None else check(name, value)
+    return partial(check_unless_none, check=check)
+
+
+def check_unless_none(name: str, value: Any, check: Check) -> Any:
+    """Check a value that may also be None."""
+    return None if value is None else check(name, value)
 
 
 def own_arguments(cls: type, base: type) -> dict[str, Parameter]:

@@ -23,7 +23,7 @@ Learn = TypeVar("Learn", bound=Callable[..., Any])
 
 # The arguments that processes need not have in common
 MAY_DIFFER = {"verbose", "device", "tensorboard_log"}
-# Before they collect, all take over process 0's attributes of these types; a ``_last_obs`` of None makes all reset
+# Before each rollout all take over process 0's attributes of these types. If its ``_last_obs`` is None, all reset
 SHARED = (bool, int, float, np.number, str, type(None), th.Generator)
 
 

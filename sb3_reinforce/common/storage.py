@@ -23,7 +23,7 @@ from sb3_reinforce.common.processes import is_leader, rank_and_size
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 # The names in REINFORCE's parameters; FiniteDifference lacks the last
 STATES_OF_BOTH = ("policy", "policy.optimizer", "critic_optimizer")
-# Flags of optimizers, which PyTorch fills in where the state of another version of it lacks them
+# Flags of optimizers: PyTorch fills in those that a state from another version of it lacks
 FLAGS = ("decoupled_weight_decay", "foreach", "fused", "maximize", "capturable", "differentiable")
 
 
@@ -79,7 +79,7 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
 
 
 def defaults_to_choose_again(saved: Mapping[str, Any], given: Set[str], n_envs: int | None) -> dict[str, None]:
-    """None for each default to choose again, if arguments are given or the environments or processes differ."""
+    """The defaults to choose again, as they are with other arguments, environments or processes; all map to None."""
     has_same_envs = n_envs in (None, saved.get("n_envs")) and rank_and_size()[1] == saved.get("_n_processes", 1)
     if not given and has_same_envs:
         return {}

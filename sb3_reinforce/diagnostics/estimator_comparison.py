@@ -14,7 +14,7 @@ from sb3_reinforce.common.arguments import (
     check_integer,
     check_kind,
     check_number,
-    optional,
+    check_unless_none,
 )
 from sb3_reinforce.diagnostics.landscapes import CandidateUtility
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
@@ -114,8 +114,8 @@ def compare_estimators(
     check_integer("n_resamples", n_resamples, 1)
     seed = check_integer("seed", seed, 0)
     check_number("confidence", confidence, 0, 1)
-    optional(partial(check_integer, low=2))("n_delta", n_delta)
-    optional(partial(check_number, low=0, above=True))("delta_std", delta_std)
+    check_unless_none("n_delta", n_delta, partial(check_integer, low=2))
+    check_unless_none("delta_std", delta_std, partial(check_number, low=0, above=True))
     draw = check_function("perturbation", perturbation, PERTURBATIONS)
     utility = CandidateUtility(model, 1, seed)
     n_parameters = len(utility.theta)

@@ -47,7 +47,7 @@ class History:
     progress_remaining: float  # from 1 to 0
     path: float  # Σ √(2 KL) over the updates of this call of learn
     n_moves: int  # how many of these changed the policy
-    share: float  # of this call since the first change, from 0 to 1
+    share: float  # of this call of learn that follows the first change of the policy, from 0 to 1
 
 
 Pitfall: TypeAlias = Callable[[History], str | None]

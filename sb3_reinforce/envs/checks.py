@@ -15,9 +15,9 @@ class BadData(ValueError):
 
 def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> None:
     """
-    Check that numbers are finite. ``where``, followed by an element's indices, begins with step and environment.
+    Check that numbers are finite. ``where`` and then an element's indices name its place.
 
-    The step None is the present one.
+    The first two are its step, or None for the present one, and its environment.
     """
     if isinstance(values, dict):
         for key, part in values.items():

@@ -1,8 +1,9 @@
 """
 Guards of the environments while a model learns or is measured: a fault is named where it enters, before it does harm.
 
-``step_wait`` and ``reset`` are replaced on instances: on the innermost ``DummyVecEnv``, not on one of a subclass, to
-check the form of observations; and on what lies right below each ``VecNormalize``, to check that numbers are finite.
+``step_wait`` and ``reset`` are replaced on instances: on the innermost VecEnv, if it is a ``DummyVecEnv`` and not of a
+subclass, to check the form of observations; and on what lies right below each ``VecNormalize``, to check that numbers
+are finite.
 """
 
 from collections.abc import Callable, Iterator

@@ -31,8 +31,8 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     if not hasattr(base, "env_method"):
         raise cannot_seed(base)
     setattr(base, MARK, True)
-    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is seeded by a reset; the reset of
-    # all that follows, which goes through every wrapper, continues its random numbers
+    # VecEnv.seed(s) can only give environment i the seed s + i, so each environment is reset with its seed. Then the
+    # reset of all passes through every wrapper and continues these random numbers
     for seed in np.unique(seeds).tolist():
         try:
             env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())

@@ -37,9 +37,9 @@ def calls(policy: ActorCriticPolicy, method: str, with_values: bool = False) -> 
     Whether a method, ``forward`` or ``evaluate_actions``, is called instead of ``get_distribution`` (and, with values,
     ``predict_values``).
 
-    True if the other two would bypass a user's code or hooks. With values also if one call saves a pass through an
-    extractor with parameters that actor and critic share, and neither of the two is overridden. False for a recurrent
-    policy, which has other methods.
+    True if these would bypass a user's code or hooks. With values also where one call saves a pass through an extractor
+    with parameters that actor and critic share, unless one of these is overridden. False for a recurrent policy, which
+    has other methods.
     """
     if isinstance(policy, RecurrentPolicy):
         return False

@@ -31,8 +31,8 @@ class ParameterGroups:
             of_critic = set(critic_parameters(policy, obs, actions))
             if policy.share_features_extractor:
                 of_actor.update(policy.features_extractor.parameters())
-            # Those that neither needs may count in training mode only, like the scale of a layer's noise: they are in
-            # both lists, and without a gradient they do not change
+            # A parameter that neither reaches may count in training mode only, like the scale of a layer's noise. It is
+            # in both lists: without a gradient it does not change
             actor = [each for each in parameters if each not in of_critic - of_actor]
             critic = [each for each in parameters if each not in of_actor]
             shared = [each for each in parameters if each in of_actor & of_critic]

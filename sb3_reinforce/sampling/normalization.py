@@ -55,7 +55,7 @@ class ObservationStatistics:
 
 
 def original_reward_of(env: VecEnv) -> tuple[Callable[[], np.ndarray] | None, VecEnv]:
-    """The method for the rewards below VecNormalize, or None; and the first VecEnv from above that may change them."""
+    """The method for rewards that VecNormalize has not scaled, or None; and the first VecEnv that may change them."""
     found = None
     while isinstance(env, VecNormalize) or type(env).step_wait in KEEP_REWARDS:
         if isinstance(env, VecNormalize) and env.norm_reward:
