@@ -47,6 +47,13 @@ def moved_by_learning(model: Any, total_timesteps: int) -> set[str]:
     return {name for name, parameter in model.policy.named_parameters() if not th.equal(parameter, before[name])}
 
 
+class Threshold(th.nn.Module):
+    """An activation without a derivative."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return (x > 0).float()
+
+
 class OwnPrediction(ActorCriticPolicy):
     """Code of the user's, which only the policy itself can run."""
 

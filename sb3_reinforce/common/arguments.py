@@ -104,7 +104,7 @@ class CheckedSchedule(FloatSchedule):
     """
     A number ≥ 0, or a function of the remaining progress (from 1 to 0), whose every value is checked.
 
-    With ``above`` a value may be 0 only at the end of training; with ``may_reach_zero`` too, anywhere after the start.
+    With ``above`` a value may be 0 only at the end of training, or, with ``may_reach_zero``, anywhere after the start.
     """
 
     def __init__(self, name: str, schedule: Any, high: float = MAX, above: bool = False, may_reach_zero: bool = False):

@@ -79,7 +79,7 @@ def check_archive(source: PathOrFile, needed: tuple[str, ...]) -> dict[str, Any]
 
 
 def defaults_to_choose_again(saved: Mapping[str, Any], given: Set[str], n_envs: int | None) -> dict[str, None]:
-    """The defaults to choose again, as they are with other arguments, environments or processes; all map to None."""
+    """The defaults to choose again if arguments are given or the environments or processes differ, each with None."""
     has_same_envs = n_envs in (None, saved.get("n_envs")) and rank_and_size()[1] == saved.get("_n_processes", 1)
     if not given and has_same_envs:
         return {}

@@ -99,8 +99,8 @@ def compare_estimators(
     :return: A table with one ``EstimatorRow`` per estimator
     :raises TypeError: If the model is neither a REINFORCE nor a FiniteDifference
     :raises ValueError: If an argument is out of its range, a name is unknown, the model has no environment or is
-        collecting a rollout, the policy has a memory, the environments cannot be seeded one by one, or the episodes are
-        not independent because they share the noise of gSDE
+        collecting a rollout, the policy has a memory or no gradient of log π, the environments cannot be seeded one by
+        one, or the episodes are not independent because they share the noise of gSDE
     """
     check_model(model, (REINFORCE, FiniteDifference), independent=True)
     check_kind("estimators", estimators, (Iterable,), "names")
@@ -185,8 +185,8 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     differentiated = parameters_of(rollout)
     if not wanted <= {*differentiated}:
         raise ValueError(
-            f"log π of {type(rollout.policy).__name__} must have derivatives for all parameters that are searched, to "
-            "compare REINFORCE with finite differences"
+            f"compare_estimators needs the gradient of log π for all parameters of the actor, and log π of "
+            f"{type(rollout.policy).__name__} has none for some of them"
         )
     mask = th.cat([th.full((parameter.numel(),), parameter in wanted) for parameter in differentiated])
     return gradients[:, mask], rollout.dones.numel()

@@ -113,7 +113,7 @@ def training_weights(model: REINFORCE) -> th.Tensor:
     rollout = cast(Rollout, model.rollout)
     batch = training_batch(rollout, model.rollout_buffer, model.normalize_advantage)
     weights = th.zeros_like(rollout.returns)
-    weights[rollout.used] = batch.weights.to(weights)
+    weights[rollout.used] = batch.weights.cpu().to(weights)
     return weights
 
 

@@ -1,6 +1,5 @@
 """θ, the parameters of a policy's actor, as one vector of float64, which holds every float32 exactly."""
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -11,24 +10,39 @@ from gymnasium.vector.utils import create_empty_array
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import obs_as_tensor
+from torch.overrides import TorchFunctionMode
 
 from sb3_reinforce.common.spaces import as_policy_actions
 from sb3_reinforce.common.tensors import to_vector
 from sb3_reinforce.policies.evaluation import (
     Parameters,
     actor_parameters,
-    critic_parameters,
     evaluation_mode,
     leave_no_graph,
     trainable,
 )
 
 
+class ParametersRead(TorchFunctionMode):
+    """The parameters that PyTorch's functions take as arguments while this mode is active."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: set[th.nn.Parameter] = set()
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        # Attributes, such as the device, say nothing about values
+        if func.__name__ != "__get__":
+            self.found |= {each for each in (*args, *kwargs.values()) if isinstance(each, th.nn.Parameter)}
+        return func(*args, **kwargs)
+
+
 def searched_parameters(policy: ActorCriticPolicy) -> Parameters:
     """
-    The trainable parameters in the policy's order, without ``log_std`` and without those that V alone depends on.
+    The trainable parameters that π(·|s) is computed from, in the policy's order, without ``log_std``.
 
-    A parameter that neither has a derivative for is searched, with a warning: it may come before a threshold.
+    They are those with a gradient of log π, and those that ``get_distribution`` reads: a policy may have no derivative.
     """
     # The memory of this package's recurrent policies and of sb3-contrib's
     if hasattr(policy, "lstm_actor"):
@@ -37,20 +51,12 @@ def searched_parameters(policy: ActorCriticPolicy) -> Parameters:
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
     with evaluation_mode(policy), th.enable_grad():
-        of_actor = {*actor_parameters(policy, obs, actions)}
-        of_critic = {*critic_parameters(policy, obs, actions)}
+        with th.compiler.set_stance("force_eager"), ParametersRead() as read:
+            policy.get_distribution(obs)
+        of_actor = read.found | {*actor_parameters(policy, obs, actions)}
         leave_no_graph(policy, obs, actions)
-    left_out = {getattr(policy, "log_std", None), *(of_critic - of_actor)}
-    searched = [parameter for parameter in trainable(policy) if parameter not in left_out]
-    unreached = {parameter for parameter in searched if parameter not in of_actor}
-    if unreached:
-        name = next(name for name, parameter in policy.named_parameters() if parameter in unreached)
-        warnings.warn(
-            f"Neither log π nor V of {type(policy).__name__} has a derivative for {len(unreached)} of its parameters "
-            f"(the first is {name}). They are searched too: call requires_grad_(False) on those that do not change "
-            "actions",
-            stacklevel=2,
-        )
+    log_std = getattr(policy, "log_std", None)
+    searched = [each for each in trainable(policy) if each in of_actor and each is not log_std]
     if not searched:
         raise ValueError(
             f"The actor of {type(policy).__name__} has no trainable parameters, so there is nothing to search"

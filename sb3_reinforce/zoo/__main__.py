@@ -28,7 +28,7 @@ SCRIPTS = ("record_video", "benchmark")
 COMMANDS = ("train", "enjoy", *PLOTS, *SCRIPTS)
 NOT_OFFERED = {
     "push_to_hub": "it cannot be imported with the huggingface_sb3 of today: upload the folder with `hf upload`",
-    "load_from_hub": "it does not know these algorithms; for the Zoo's own: python -m rl_zoo3.load_from_hub",
+    "load_from_hub": "no models of these algorithms are published; for the Zoo's: python -m rl_zoo3.load_from_hub",
     "record_training": "record the checkpoints one by one: record_video --load-checkpoint STEPS",
 }
 

@@ -9,12 +9,12 @@ import torch as th
 from callbacks import Record
 from environments import Corridor, Tree
 from gymnasium import spaces
-from models import Dropping, Normalized, plain
+from models import Dropping, Normalized, Threshold, plain
 from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_reinforce import REINFORCE
+from sb3_reinforce import REINFORCE, FiniteDifference
 from sb3_reinforce.diagnostics import (
     GradientQualityCallback,
     PitfallCallback,
@@ -148,6 +148,13 @@ def test_a_model_without_environments_is_refused(measure):
     model.env = None
     with pytest.raises(ValueError, match="set_env"):
         measure(model)
+
+
+def test_a_threshold_in_the_actor_has_no_likelihood_ratio_to_compare():
+    kwargs = {"net_arch": [4], "activation_fn": Threshold}
+    model = FiniteDifference("MlpPolicy", "CartPole-v1", device="cpu", n_delta=2, policy_kwargs=kwargs)
+    with pytest.raises(ValueError, match="needs the gradient of log π for all parameters"):
+        compare_estimators(model, 4, 3, n_delta=2, n_resamples=2)
 
 
 REFUSING = ("check_gradient", "compare_baselines", "compare_estimators", "compare_starts", "sample")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from models import Normalized
+from models import Normalized, Threshold
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy
 
 from sb3_reinforce import REINFORCE, FiniteDifference
@@ -38,13 +38,6 @@ def test_a_shared_features_extractor_is_part_of_the_actor() -> None:
     assert not any("value" in name for name in names(policy))
 
 
-class Threshold(th.nn.Module):
-    """An activation without a derivative."""
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return (x > 0).float()
-
-
 class NoGradient(ActorCriticPolicy):
     """A policy whose log π has no derivative at all."""
 
@@ -53,17 +46,27 @@ class NoGradient(ActorCriticPolicy):
             return super().get_distribution(obs)
 
 
-@pytest.mark.parametrize("policy_class, activation", [(ActorCriticPolicy, Threshold), (NoGradient, th.nn.Tanh)])
+class WithUnusedLayer(NoGradient):
+    """A policy with a layer that no action depends on, and without a critic."""
+
+    def _build(self, lr_schedule) -> None:
+        super()._build(lr_schedule)
+        self.unused = th.nn.Linear(4, 4)
+        del self.value_net, self.mlp_extractor.value_net
+
+
+@pytest.mark.parametrize(
+    "policy_class, activation",
+    [(ActorCriticPolicy, Threshold), (NoGradient, th.nn.Tanh), (WithUnusedLayer, th.nn.Tanh)],
+)
 def test_a_policy_without_derivatives_is_searched(policy_class: type[ActorCriticPolicy], activation: type) -> None:
     kwargs = {"net_arch": [4], "activation_fn": activation}
+    model = FiniteDifference(policy_class, "CartPole-v1", estimator="central", seed=0, policy_kwargs=kwargs)
     layers = ("mlp_extractor.policy_net.0", "action_net")
-    with pytest.warns(UserWarning, match=r" of its parameters \(the first is mlp_extractor.policy_net.0.weight\)"):
-        model = FiniteDifference(policy_class, "CartPole-v1", estimator="central", seed=0, policy_kwargs=kwargs)
-        model.policy.mlp_extractor.value_net.requires_grad_(False)
-        hidden = model.policy.mlp_extractor.policy_net[0].weight
-        before = hidden.detach().clone()
-        model.learn(1)
-        assert names(model.policy) == {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+    assert names(model.policy) == {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+    hidden = model.policy.mlp_extractor.policy_net[0].weight
+    before = hidden.detach().clone()
+    model.learn(1)
     assert not th.equal(hidden, before)
 
 
