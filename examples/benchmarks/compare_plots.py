@@ -6,11 +6,13 @@ What a comparison shows: tables, learning curves, and a summary by rliable (inte
 Writes results_curves.png (the interquartile mean of the seeds against steps, and against CPU seconds, of the seeds that
 all algorithms were run on) and results_summary.png (interquartile mean, performance profiles and probability of
 improvement over all tasks), and prints the final evaluations. In the summary 0 is a random policy and 1 the Zoo's
-published PPO, or another reference; it has the algorithms that were run on every task.
+published PPO, or another reference; it has the algorithms that were run on every task. --steps-only leaves out the
+curves against seconds, which can only be compared between runs on one machine.
 """
 
 import argparse
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -67,32 +69,34 @@ def curve(runs: pd.DataFrame, column: str, end: float) -> tuple[np.ndarray, np.n
     return points, *interquartile_interval(scores[:, None], REPETITIONS, 0.95, seed=0)
 
 
-def draw_curves(results: pd.DataFrame) -> None:
+def draw_curves(results: pd.DataFrame, columns: Sequence[str]) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
-    n_rows = (len(tasks) + 1) // 2
+    n_rows = math.ceil(len(tasks) * len(columns) / 4)
     figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
-    pairs = grid.reshape(-1, 2)
-    for axes, ((task, budget), runs) in zip(pairs, tasks, strict=False):
+    rows = grid.reshape(-1, len(columns))
+    for axes, ((task, budget), runs) in zip(rows, tasks, strict=False):
         common = set.intersection(*(set(mine["seed"]) for _, mine in runs.groupby("algorithm")))
         timed = runs[runs["seed"].isin(common)]
-        for axis, column, drawn in zip(axes, ("steps", "cpu_seconds"), (runs, timed), strict=True):
+        for axis, column in zip(axes, columns, strict=True):
+            drawn = runs if column == "steps" else timed
             for algorithm, mine in drawn.groupby("algorithm", sort=False):
                 end = budget if column == "steps" else mine[mine["evaluation"] == "final"][column].median()
                 points, iqm, low, high = curve(mine, column, end)
                 axis.plot(points, iqm, color=color(algorithm), label=LABELS.get(algorithm, algorithm))
                 axis.fill_between(points, low, high, color=color(algorithm), alpha=0.2, linewidth=0)
-        axes[0].set(title=task, xlabel="steps", ylabel="return", xticks=(0, budget), xticklabels=("0", f"{budget:,}"))
-        axes[1].set(title=task, xlabel="CPU seconds", xscale="symlog")
+            axis.set(title=task, xlabel="CPU seconds", xscale="symlog")
+        axes[0].set(xlabel="steps", ylabel="return", xscale="linear", xticks=(0, budget))
+        axes[0].set_xticklabels(("0", f"{budget:,}"))
         for axis in axes:
             # The bands of early runs that fail would leave the lines little height
             values = np.concatenate([line.get_ydata() for line in axis.get_lines()])
             margin = 0.05 * np.ptp(values)
             axis.set_ylim(values.min() - margin, values.max() + margin)
             axis.title.set_fontsize("medium")
-    for axis in pairs[len(tasks) :].flat:
+    for axis in rows[len(tasks) :].flat:
         axis.set_axis_off()
     # An algorithm need not have been run on the first task
-    lines = {line.get_label(): line for axis in pairs[:, 0] for line in axis.get_lines()}
+    lines = {line.get_label(): line for axis in rows[:, 0] for line in axis.get_lines()}
     legend = {"loc": "outside upper center", "ncols": len(lines), "frameon": False}
     counts = results.groupby(["task", "algorithm"])["seed"].nunique()
     title = f"interquartile mean of {seeds(counts)}, bands: 95 % bootstrap intervals"
@@ -167,6 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="CSVs that compare.py has written")
     parser.add_argument("--output", type=Path, required=True, help="path of the pictures, without suffix")
+    parser.add_argument("--steps-only", action="store_true", help="draw no curves against seconds")
     arguments = parser.parse_args()
     matplotlib.use("agg")
     results = pd.concat(pd.read_csv(path) for path in arguments.results)
@@ -182,7 +187,7 @@ def main() -> None:
     )
     final = results[results["evaluation"] == "final"].groupby(["task", "budget", "algorithm"], sort=False)
     print(final[["return", "cpu_seconds"]].agg(["count", "median", "min", "max"]).to_string())
-    draw_curves(results)
+    draw_curves(results, ("steps",) if arguments.steps_only else ("steps", "cpu_seconds"))
     plt.savefig(arguments.output.with_name(f"{arguments.output.name}_curves.png"), dpi=120)
     scores = final_scores(results)
     if not scores:

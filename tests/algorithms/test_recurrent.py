@@ -128,6 +128,14 @@ def outputs_of(policy, episode):
     return logits[-1], float(values[-1])
 
 
+def test_with_gsde_the_sequences_of_training_have_the_log_probabilities_of_the_steps():
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    log_probs = Record(lambda model: model.rollout_buffer.log_probs.ravel())
+    model = make_recurrent(env=env, double=False, n_steps=8, learning_rate=0.0, use_sde=True).learn(16, log_probs)
+    trained_on = log_prob_of(model.policy, flatten(model.rollout.inputs), flatten(model.rollout.actions))
+    np.testing.assert_allclose(trained_on.detach(), log_probs.records[0], rtol=1e-4)
+
+
 def copy_of(buffer):
     return buffer.episode_starts.copy(), buffer.log_probs.copy()
 

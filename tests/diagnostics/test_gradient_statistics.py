@@ -123,6 +123,19 @@ def test_the_noise_of_the_reference_does_not_lower_the_cosine():
     assert abs(np.mean(values) - truth) < 4 * np.std(values) / 20 < 0.03
 
 
+@pytest.mark.parametrize("name", ["variance", "snr", "noise_scale", "cosine"])
+def test_more_confidence_takes_a_wider_interval_and_another_seed_other_resamples(name):
+    gradients = draw(32, th.Generator().manual_seed(1))
+
+    def found(**kwargs):
+        statistics = gradient_statistics(gradients, MEAN.roll(1), n_resamples=200, **kwargs)
+        return getattr(statistics, name)
+
+    wide, narrow = found(confidence=0.99), found(confidence=0.5)
+    assert wide.low < narrow.low < narrow.high < wide.high
+    assert found(seed=1).low != found(seed=0).low
+
+
 def test_an_interval_holds_its_estimate_and_can_be_infinite():
     values = th.cat([th.tensor([2.0]), th.linspace(0, 4, 99), th.tensor([th.inf])]).double()
     assert interval(values, 0.9).low < interval(values, 0.9).value < interval(values, 0.9).high

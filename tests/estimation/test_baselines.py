@@ -62,6 +62,11 @@ def test_a_timestep_that_one_episode_reaches_has_a_defined_weight():
     assert leave_one_out(alone).tolist() == [[0], [0]]
 
 
+def test_a_difference_of_a_billionth_of_the_returns_is_no_rounding():
+    pair = make_rollout([[1e6, 1e6 + 1e-3]], dones=[[1, 1]], timesteps=[[0, 0]])
+    assert compute_advantages(pair, leave_one_out(pair)).ravel() == pytest.approx([-1e-3, 1e-3], rel=1e-3)
+
+
 @pytest.mark.parametrize("baseline", ["mean", "time_mean", "leave_one_out", "optimal"])
 def test_a_batch_without_variance_has_no_gradient(baseline):
     """Some baselines differ from equal returns by the rounding of float64, which compute_advantages removes."""

@@ -95,6 +95,7 @@ def test_the_gradient_lab_measures_a_masked_policy():
     env = make_vec_env(environment, 4, seed=0)
     model = make("episodes", env, policy_kwargs={"net_arch": []}).learn(200, PitfallCallback())
     assert check_gradient(model).passed
+    assert check_gradient(make("recurrent", env)).passed
     assert len(compare_baselines(model, 8, n_resamples=2)) > 0
     assert len(compare_estimators(model, 8, 3, n_delta=2, n_resamples=2)) > 0
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import Record
-from environments import Corridor
+from environments import Corridor, Faulty
 from gymnasium.wrappers import TimeLimit
-from models import make
+from models import all_kinds, make
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -41,6 +41,30 @@ def test_whole_episodes_begin_with_a_reset_where_the_user_has_stepped_the_enviro
     model.env.step(np.zeros(1, dtype=int))
     model.learn(1, reset_num_timesteps=False)
     assert model.rollout_buffer.observations[:, 0].argmax(-1).tolist() == [0, 1, 2] * 2
+
+
+def test_environments_that_have_all_ended_an_episode_are_not_reset_again():
+    env = Faulty()
+    make("episodes", env).learn(28)
+    # By learn, and after each of four episodes
+    assert env.n_resets == 5
+
+
+class Succeeds(Corridor):
+    """Says at the end of an episode that it succeeded."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, {"is_success": True} if terminated else info
+
+
+@all_kinds
+def test_successes_are_those_of_the_episodes_that_count(kind):
+    """The first environment ends its episodes too early to say anything, at other steps than the second one."""
+    envs = [lambda: Monitor(TimeLimit(Succeeds((9,)), 2)), lambda: Monitor(Succeeds((9,)))]
+    model = make(kind, DummyVecEnv(envs)).learn(80)
+    lengths = [episode["l"] for episode in model.ep_info_buffer]
+    assert list(model.ep_success_buffer) == [True] * lengths.count(9) != []
 
 
 def test_a_monitor_may_refuse_the_reset_that_whole_episodes_begin_with():
@@ -149,6 +173,32 @@ def test_the_critic_stands_in_at_a_cut_and_a_time_limit_and_never_after_a_termin
         model.policy.value_net.bias.fill_(8.0)
     model.learn(len(expected))
     np.testing.assert_allclose(model.rollout_buffer.returns.ravel(), expected)
+
+
+class WithoutTerminalObservation(VecEnvWrapper):
+    """Says that a time limit ended an episode, but not with which observation."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return (
+            obs,
+            rewards,
+            dones,
+            [{key: info[key] for key in info.keys() - {"terminal_observation"}} for info in infos],
+        )
+
+
+def test_a_time_limit_without_an_observation_is_an_end_as_in_a2c():
+    env = WithoutTerminalObservation(make_vec_env(lambda: Corridor(truncate=True, reward=lambda t, action: 0.0), 1))
+    model = make("steps", env, n_steps=3)
+    with th.no_grad():
+        model.policy.value_net.weight.zero_()
+        model.policy.value_net.bias.fill_(8.0)
+    model.learn(3)
+    assert not model.rollout_buffer.returns.any()
 
 
 def test_the_buffer_is_that_of_a2c():

@@ -21,6 +21,7 @@ from sb3_reinforce import ActionMaskObservation
 from sb3_reinforce.policies.memories import MEMORIES
 from sb3_reinforce.zoo import ALGORITHMS, HYPERPARAMS
 from sb3_reinforce.zoo.experiments import make_experiment
+from sb3_reinforce.zoo.settings import scheduled_keys
 
 SCHEDULED = {
     "reinforce": {"learning_rate", "critic_learning_rate", "ent_coef", "temperature"},
@@ -90,6 +91,9 @@ def test_the_published_default_fits_observations_that_cannot_be_normalized(
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_argument_that_may_be_a_schedule_may_fall(name, tmp_path):
+    # The last two go with other actions, or with the natural step
+    assert scheduled_keys(name) - {"min_std", "target_kl"} == SCHEDULED[name]
+    assert name == "finite_difference" or scheduled_keys(name) >= {"min_std", "target_kl"}
     entry = dict.fromkeys(SCHEDULED[name], "lin_5E-1")
     entry |= {"policy": POLICIES[name], "n_timesteps": 64} | ({"n_delta": 2} if "delta_std" in entry else {})
     train(name, *conf(tmp_path, **{"CartPole-v1": entry}))
