@@ -241,8 +241,9 @@ class FiniteDifference(BasePolicyGradient):
         :raises ValueError: If an argument is out of its range, the model has no environment, PyTorch's default device
             is not the CPU, processes under torchrun have different arguments, nothing is left to search, a user's
             estimator or perturbation returns another shape, a perturbation, reward, observation or action is not
-            finite, all perturbations are zero (for ``"regression"``: equal), or an episode does not end; and as in
-            ``train``. The policy is the last good one
+            finite, all perturbations are zero (for ``"regression"``: equal), an episode does not end, or with common
+            random numbers the environments cannot be seeded one by one; and as in ``train``. The policy is the last
+            good one
         :raises ConnectionError: If a worker of a ``SubprocVecEnv`` dies
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """

@@ -185,7 +185,9 @@ class RecurrentREINFORCE(REINFORCE):
     def _evaluate_critic(self, buffer: RolloutBuffer, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """V(s_t) and V(s_{t+1}); what follows a cut or a time limit is one more row of its sequence."""
         policy = self.policy
-        dones, terminal_obs, state = columns.dones, columns.terminal_obs, columns.state
+        dones = columns.dones
+        terminal_obs = columns.terminal_obs
+        state = columns.state
         if state is not None and self._next_state is not None:
             goes_on = th.as_tensor(buffer.episode_starts[0] == 0).to(self.device)
             state[:, 1] = self._next_state[: len(state), 1].to(self.device) * goes_on[..., None, None, None]

@@ -315,8 +315,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         :raises TypeError: If an argument of the model has been changed to a wrong type, or a baseline returns no tensor
         :raises ValueError: If an argument has been changed to a wrong value, a baseline returns a tensor of another
             shape, a reward, an observation, an action or a baseline is not finite, no episode ended in a rollout that
-            needs one, or an episode does not end. The parameters have not changed. Environments that stopped in the
-            middle of episodes are reset before the next rollout
+            needs one, an episode does not end, or the environments of ``episodes_per_start`` ignore their seed. The
+            parameters have not changed. Environments that stopped in the middle of episodes are reset before the next
+            rollout
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
@@ -498,6 +499,9 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.step == "natural":
             target_kl = DEFAULT_TARGET_KL if self.target_kl is None else self._scheduled("target_kl")
             check_distribution(self.policy, obs, actions, log_prob)
+            # As after an optimizer's step, for a callback
+            for parameter, gradient in zip(actor, gradients, strict=True):
+                parameter.grad = gradient
             return natural_step(self.policy, obs, actor, gradients, target_kl)
         if plain_actor(self.policy) is None:
             # Passes over images take long, and log π in training mode may differ, as with dropout

@@ -60,7 +60,8 @@ def compare_baselines(
     With an MlpPolicy, all names together cost a few forward and backward passes over the episodes, which
     ``examples/benchmarks/comparison_cost.py`` measures.
 
-    :param model: The model; it is not changed, and its environments are left at the start of an episode
+    :param model: The model; it is not changed, but a baseline with a memory learns from these episodes too. Its
+        environments are left at the start of an episode
     :param n_episodes: Number of episodes, at least 3
     :param baselines: Names or functions; None for all names, ``"value"`` only if the model has a critic
     :param reference: Name of the baseline in the denominator of ``ratio``

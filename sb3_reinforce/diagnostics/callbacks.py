@@ -54,7 +54,8 @@ class GradientQualityCallback(Diagnosis):
     is the same with and without it.
 
     :param every: Rollouts between two measurements
-    :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic
+    :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic. A function
+        with a memory learns from each measurement too
     :param max_episodes: Largest number of episodes of a rollout that are used
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference

@@ -26,7 +26,7 @@ Estimator: TypeAlias = Callable[[Utility, th.Tensor, th.Tensor], th.Tensor]
 def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) -> th.Tensor:
     """
     ``Δ ĝ ≈ U(θ + Δ) − U(θ)``: k + 1 evaluations, error of order 1 in ‖Δ‖; exact on linear utilities if
-    the perturbations span all dimensions.
+    the perturbations span all dimensions (Peters and Schaal, 2008, section 3.1).
 
     :param utility: U
     :param theta: θ, shape ``(n,)``
@@ -45,7 +45,7 @@ def forward_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor) ->
 def central_difference(utility: Utility, theta: th.Tensor, deltas: th.Tensor, n_top: int | None = None) -> th.Tensor:
     """
     ``2Δ ĝ ≈ U(θ + Δ) − U(θ − Δ)``: 2k evaluations, error of order 2 in ‖Δ‖; exact on quadratic utilities
-    if the perturbations span all dimensions.
+    if the perturbations span all dimensions (Peters and Schaal, 2008, section 3.1).
 
     :param utility: U, which gets all candidates at once, shape ``(2, k, n)``, and returns ``(2, k)``
     :param theta: θ, shape ``(n,)``

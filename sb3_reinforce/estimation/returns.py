@@ -1,5 +1,5 @@
 """
-Returns of a rollout, as pure functions of arrays of shape ``(n_steps, n_envs)``.
+Returns of a rollout, as pure functions of NumPy arrays of shape ``(n_steps, n_envs)``.
 
 Time is the first axis. ``dones[t]`` is True where step t is the last of its episode; episodes may start before the
 rollout and continue after it. ``next_values[t]`` is V(s_{t+1}): 0 after a terminal state, and 0 everywhere without a
@@ -76,7 +76,7 @@ def reward_to_go(rewards: Floats, dones: Bools, gamma: float) -> Floats:
 
 def total_return(reward_to_go: Floats, timesteps: Integers, gamma: float, earlier_rewards: Floats) -> Floats:
     """
-    ``G_0 = Σ_{k<t} γ^k r_k + γ^t G_t``, the same at every step of an episode.
+    ``G_0 = Σ_{k<t} γ^k r_k + γ^t G_t``, the same at every step of an episode (Williams, 1992, for γ = 1).
 
     Evaluated at the episode's first step in the rollout, where the sum over k < t was earned in earlier rollouts.
 

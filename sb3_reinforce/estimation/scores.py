@@ -47,7 +47,8 @@ def gradients_by_episode(
     ``Σ_t w_t ∇θ log π(a_t|s_t)`` over the used steps of each episode, for each of k weights.
 
     θ are the trainable parameters that log π of the rollout's first step depends on, in the order of
-    ``policy.parameters()``.
+    ``policy.parameters()``. For Box actions ``log_std`` comes first, which the θ of a search and of ``landscape``
+    lacks.
 
     :param rollout: The rollout, with m episodes that have used steps
     :param weights: k times w_t, each of shape ``(n_steps, n_envs)``

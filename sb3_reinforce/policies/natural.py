@@ -87,8 +87,16 @@ def natural_step(
 
 @th.no_grad()
 def check_distribution(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, log_prob: th.Tensor) -> None:
-    """Refuse a policy whose distribution in evaluation mode has another log π than the one that it learns from."""
-    own = action_distribution(policy, obs).log_prob(actions)
+    """Refuse a distribution without a known KL, or with another log π in evaluation mode than the one that learns."""
+    distribution = action_distribution(policy, obs)
+    try:
+        kl_divergence(distribution, distribution)
+    except (AssertionError, AttributeError, NotImplementedError) as error:
+        raise ValueError(
+            f"step='natural' needs a KL divergence that PyTorch knows, and {type(distribution).__name__} of "
+            f"{type(policy).__name__} has none: use step='optimizer'"
+        ) from error
+    own = distribution.log_prob(actions)
     if not th.allclose(own, log_prob, rtol=1e-3, atol=1e-4):
         raise ValueError(
             f"step='natural' needs the distribution of the actions, and get_distribution of {type(policy).__name__} "

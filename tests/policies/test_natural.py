@@ -13,6 +13,7 @@ from gymnasium import spaces
 from models import Dropping, Normalized, make
 from sb3_contrib.common.envs import InvalidActionEnvMultiDiscrete
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -149,6 +150,41 @@ def independent(distribution):
     """The distributions of PyTorch whose product it is."""
     inner = distribution.distribution
     return inner if isinstance(inner, list) else [inner]
+
+
+class Unknown(DiagGaussianDistribution):
+    """A distribution of the user's, whose KL divergence nobody knows."""
+
+    def proba_distribution(self, *args):
+        super().proba_distribution(*args)
+        self.distribution = [self.distribution]
+        return self
+
+    def log_prob(self, actions):
+        return self.distribution[0].log_prob(actions).sum(1)
+
+    def entropy(self):
+        return self.distribution[0].entropy().sum(1)
+
+    def sample(self):
+        return self.distribution[0].sample()
+
+
+def test_a_distribution_without_a_known_divergence_is_named():
+    model = REINFORCE("MlpPolicy", "Pendulum-v1", step="natural", n_steps=8)
+    model.policy.action_dist = Unknown(1)
+    model.policy.get_distribution = lambda obs: Unknown(1).proba_distribution(
+        model.policy.action_net(obs[:, :1].repeat(1, 64)), model.policy.log_std
+    )
+    with pytest.raises(ValueError, match="a KL divergence that PyTorch knows, and Unknown of ActorCriticPolicy"):
+        model.learn(8)
+
+
+def test_the_gradient_of_the_loss_is_left_for_a_callback():
+    model = make("steps", step="natural")
+    model.learn(8)
+    gradient = to_vector([each.grad for each in model.policy.mlp_extractor.policy_net.parameters()])
+    assert 0 < gradient.norm() <= model.logger.name_to_value["train/grad_norm"]
 
 
 def divergences_of(model, total_timesteps):
