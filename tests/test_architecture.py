@@ -215,11 +215,14 @@ def test_public_names_are_there_and_documented(module_name: str) -> None:
 
 
 @pytest.mark.parametrize("table", ["BASELINES", "ESTIMATORS", "PERTURBATIONS"])
-def test_every_named_function_is_in_the_docs_and_the_docstring(table: str) -> None:
+def test_every_named_function_is_in_the_docs_the_docstring_and_the_enumeration(table: str) -> None:
     """What else is due when one is added; CONTRIBUTING.md lists the rest."""
     page = "rollouts.md" if table == "BASELINES" else "finite_difference.md"
     text = (Path(__file__).parents[1] / "docs" / page).read_text(encoding="utf-8")
     algorithm = sb3_reinforce.REINFORCE if table == "BASELINES" else sb3_reinforce.FiniteDifference
     names = getattr(importlib.import_module("sb3_reinforce.estimation"), table)
     missing = [name for name in names if f'`"{name}"`' not in text or f'``"{name}"``' not in str(algorithm.__doc__)]
+    if table == "BASELINES":
+        enumeration = (Path(__file__).parent / "estimation" / "test_enumeration.py").read_text(encoding="utf-8")
+        missing += [name for name in names if f'"{name}"' not in enumeration]
     assert not missing
