@@ -62,9 +62,9 @@ class FiniteDifference(BasePolicyGradient):
         ``regression: [1 Δ] [u₀ ĝ]ᵀ ≈ U(θ+Δ)``
 
     (Peters and Schaal, 2008, section 3.1). No derivative of the policy is used, and returns are undiscounted. θ is the
-    actor's parameters, those that π(·|s) is computed from for an observation near 0; the critic and ``log_std`` are not
-    searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward pass,
-    other policies one after the other.
+    actor's parameters, those that the action for an observation near 0 is computed from; the critic and ``log_std`` are
+    not searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward
+    pass, other policies one after the other.
 
     The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. The
     observations of an update are added to them afterwards. The first update uses the statistics of the first reset.
@@ -189,16 +189,18 @@ class FiniteDifference(BasePolicyGradient):
         if self._generator is None:
             self._generator = new_generator()
 
-    def _check_arguments(self) -> None:
-        """Check the arguments as they are now, and choose ``n_delta`` where the user has not."""
+    def _check_arguments(self) -> list[th.nn.Parameter]:
+        """Check the arguments as they are now, and choose ``n_delta`` if it is open; return what is searched."""
         check_finite_difference(self)
         if self.env is not None:
             check_scale(self.env)
         # Also where n_delta is given: an error if there is nothing to search
-        n_parameters = self.n_parameters
+        searched = parameters.searched_parameters(self.policy)
         if self.n_delta is None:
+            n_parameters = sum(parameter.numel() for parameter in searched)
             n_delta = default_n_delta(n_parameters, self.estimator, self.perturbation)
             self._choose("n_delta", max(n_delta, self.n_top or 0))
+        return searched
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the global generators and the environments, and with a seed the perturbations too."""
@@ -293,11 +295,10 @@ class FiniteDifference(BasePolicyGradient):
             raise ValueError("estimate_gradient needs the counters and the log that learn creates: call learn(0) first")
         callback.on_rollout_start()
         # The user or a callback may have changed arguments
-        self._check_arguments()
+        searched = self._check_arguments()
         self.start_round()
         self.is_collecting = True
         try:
-            searched = parameters.searched_parameters(self.policy)
             theta = parameters.read(searched)
             n = len(theta)
             n_delta = cast(int, self.n_delta)

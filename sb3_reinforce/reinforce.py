@@ -437,10 +437,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         One policy step along ĝ, then the critic's passes.
 
         :raises ValueError: If a gradient or a parameter becomes non-finite, if there is no rollout, or if, with the
-            natural step, ``get_distribution`` does not give the log π that is trained. A step with a non-finite
-            gradient is not taken. After a non-finite parameter the parameters are those before the policy's step or
-            before the critic's passes, and the state of the optimizer that made the step is cleared. If the critic
-            fails, the policy keeps its step
+            natural step, ``get_distribution`` does not give the log π that is trained or its KL divergence is unknown.
+            A step with a non-finite gradient is not taken. After a non-finite parameter the parameters are those before
+            the policy's step or before the critic's passes, and the state of the optimizer that made the step is
+            cleared. If the critic fails, the policy keeps its step
         """
         rollout = self.rollout
         if rollout is None:

@@ -55,7 +55,7 @@ class GradientQualityCallback(Diagnosis):
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic. A function
-        with a memory learns from each measurement too
+        with a memory learns from each measurement too: pass another instance than the model's
     :param max_episodes: Largest number of episodes of a rollout that are used
     :param verbose: Verbosity level
     :raises TypeError: If an argument is of the wrong kind, or the model is neither a REINFORCE nor a FiniteDifference

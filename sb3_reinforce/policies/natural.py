@@ -87,7 +87,7 @@ def natural_step(
 
 @th.no_grad()
 def check_distribution(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, log_prob: th.Tensor) -> None:
-    """Refuse a distribution without a known KL, or with another log π in evaluation mode than the one that learns."""
+    """Refuse a distribution without a known KL, or with another log π in evaluation mode than the one in training."""
     distribution = action_distribution(policy, obs)
     try:
         kl_divergence(distribution, distribution)

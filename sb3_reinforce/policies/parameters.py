@@ -32,27 +32,31 @@ class ParametersRead(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        # Attributes, such as the device, say nothing about values
-        if func.__name__ != "__get__":
-            self.found |= {each for each in (*args, *kwargs.values()) if isinstance(each, th.nn.Parameter)}
-        return func(*args, **kwargs)
+        result = func(*args, **kwargs)
+        # Of the attributes only those such as T and data have values
+        if func.__name__ != "__get__" or isinstance(result, th.Tensor):
+            for each in (*args, *kwargs.values()):
+                parts = each if isinstance(each, (list, tuple)) else (each,)
+                self.found |= {part for part in parts if isinstance(part, th.nn.Parameter)}
+        return result
 
 
 def searched_parameters(policy: ActorCriticPolicy) -> Parameters:
     """
-    The trainable parameters that π(·|s) is computed from, in the policy's order, without ``log_std``.
+    The trainable parameters that actions are computed from, in the policy's order, without ``log_std``.
 
-    They are those with a gradient of log π, and those that ``get_distribution`` reads: a policy may have no derivative.
+    They are those with a gradient of log π, and those that ``predict`` reads: a policy may have no derivative.
     """
     # The memory of this package's recurrent policies and of sb3-contrib's
     if hasattr(policy, "lstm_actor"):
         raise ValueError(f"A policy whose parameters are searched must have no memory, got {type(policy).__name__}")
-    obs = obs_as_tensor(observation_in(policy.observation_space), policy.device)
+    observation = observation_in(policy.observation_space)
+    obs = obs_as_tensor(observation, policy.device)
     zeros = th.zeros(1, get_action_dim(policy.action_space), device=policy.device)
     actions = as_policy_actions(zeros, policy.action_space)
     with evaluation_mode(policy), th.enable_grad():
         with th.compiler.set_stance("force_eager"), ParametersRead() as read:
-            policy.get_distribution(obs)
+            policy.predict(observation, deterministic=True)
         of_actor = read.found | {*actor_parameters(policy, obs, actions)}
         leave_no_graph(policy, obs, actions)
     log_std = getattr(policy, "log_std", None)

@@ -46,18 +46,30 @@ class NoGradient(ActorCriticPolicy):
             return super().get_distribution(obs)
 
 
+class ByHand(ActorCriticPolicy):
+    """A policy that computes its actions itself, from transposed parameters and from a list of them."""
+
+    def _predict(self, observation, deterministic=False):
+        hidden = observation @ self.mlp_extractor.policy_net[0].weight.T > self.mlp_extractor.policy_net[0].bias
+        layer = th.cat([self.action_net.weight, self.action_net.bias[:, None]], dim=1)
+        return (th.nn.functional.pad(hidden.float(), (0, 1), value=1.0) @ layer.T).argmax(1)
+
+
 class WithUnusedLayer(NoGradient):
     """A policy with a layer that no action depends on, and without a critic."""
 
+    def _build_mlp_extractor(self) -> None:
+        super()._build_mlp_extractor()
+        self.unused = th.nn.Linear(4, 4)
+
     def _build(self, lr_schedule) -> None:
         super()._build(lr_schedule)
-        self.unused = th.nn.Linear(4, 4)
         del self.value_net, self.mlp_extractor.value_net
 
 
 @pytest.mark.parametrize(
     "policy_class, activation",
-    [(ActorCriticPolicy, Threshold), (NoGradient, th.nn.Tanh), (WithUnusedLayer, th.nn.Tanh)],
+    [(ActorCriticPolicy, Threshold), (NoGradient, th.nn.Tanh), (WithUnusedLayer, th.nn.Tanh), (ByHand, Threshold)],
 )
 def test_a_policy_without_derivatives_is_searched(policy_class: type[ActorCriticPolicy], activation: type) -> None:
     kwargs = {"net_arch": [4], "activation_fn": activation}
