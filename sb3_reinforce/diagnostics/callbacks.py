@@ -17,7 +17,7 @@ from sb3_reinforce.diagnostics.sampling import check_model, evenly_spread, train
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, noise_scale, signal_to_noise, variance
 from sb3_reinforce.estimation.baselines import Baseline
 from sb3_reinforce.estimation.rollout import Rollout
-from sb3_reinforce.estimation.scores import first_step, gradient_blocks, parameters_of
+from sb3_reinforce.estimation.scores import first_step, gradient_blocks
 from sb3_reinforce.estimation.weights import training_batch
 from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.evaluation import (
@@ -93,12 +93,16 @@ class GradientQualityCallback(Diagnosis):
             # A cosine needs the parameters at the ends of three rollouts in a row
             return
         is_search = isinstance(self.model, FiniteDifference)
-        try:
-            theta = self.model.theta if is_search else to_vector(parameters_of(self.model.rollout))
-        except ValueError:
-            # The actor is frozen
-            self.thetas.clear()
-            return
+        if is_search:
+            theta = self.model.theta
+        else:
+            rollout = self.model.rollout
+            actor = actor_parameters(rollout.policy, *first_step(rollout))
+            if not actor:
+                # It is frozen
+                self.thetas.clear()
+                return
+            theta = to_vector(actor)
         if self.thetas and self.thetas[-1].shape != theta.shape:
             self.thetas.clear()
         self.thetas.append(theta)
