@@ -83,13 +83,13 @@ def replace(stack: ExitStack, env: VecEnv, name: str, method: Callable[[], Any])
 
 
 def finite_step(step: Callable[[], VecEnvStepReturn]) -> VecEnvStepReturn:
-    """What ``step`` returns, if all its numbers are finite."""
+    """What ``step`` returns, if all its numbers are finite; ``dones`` as booleans, with which VecNormalize indexes."""
     obs, rewards, dones, infos = step()
     check_finite("The reward", rewards, (None,))
     check_finite("The observation", obs, (None,))
     for i in np.flatnonzero(dones).tolist():
         check_finite("The terminal observation", infos[i].get("terminal_observation", 0), (None, i))
-    return obs, rewards, dones, infos
+    return obs, rewards, np.asarray(dones, dtype=bool), infos
 
 
 def finite_reset(reset: Callable[[], VecEnvObs]) -> VecEnvObs:

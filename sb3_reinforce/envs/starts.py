@@ -36,7 +36,8 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     for seed in np.unique(seeds).tolist():
         try:
             env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
-        except NotImplementedError as error:
+        # Some VecEnvs pass the indices on to the environment
+        except (NotImplementedError, TypeError) as error:
             raise cannot_seed(base) from error
     return env.reset()
 

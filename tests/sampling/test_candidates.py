@@ -292,6 +292,19 @@ def test_the_rewards_are_those_below_vec_normalize_and_above_other_wrappers(wrap
     assert evaluate(wrap(DummyVecEnv([Counting])), [1])[0][0, 0] == pytest.approx(expected)
 
 
+class WithIndices(Wrapper):
+    """Passes the indices on to the environments, as Isaac Lab's VecEnv does."""
+
+    def env_method(self, name, *args, **kwargs):
+        return [getattr(env, name)(*args, **kwargs) for env in self.venv.envs]
+
+
+def test_environments_that_do_not_know_indices_cannot_be_seeded():
+    model = FiniteDifference("LinearPolicy", WithIndices(make_vec_env("CartPole-v1", 2)), device="cpu")
+    with pytest.raises(ValueError, match="DummyVecEnv does not support it here"):
+        model.learn(1)
+
+
 def test_a_scale_that_is_never_learned_is_refused():
     """While candidates are compared, a VecNormalize learns nothing: it would clip rewards of any size to ±10."""
     env = VecMonitor(Shifted(VecNormalize(DummyVecEnv([Counting]))))

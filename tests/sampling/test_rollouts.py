@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import Record
-from environments import Corridor, Faulty
+from environments import Corridor, Faulty, Reused
 from gymnasium.wrappers import TimeLimit
 from models import all_kinds, make
 from stable_baselines3.common.env_util import make_vec_env
@@ -48,6 +48,15 @@ def test_environments_that_have_all_ended_an_episode_are_not_reset_again():
     make("episodes", env).learn(28)
     # By learn, and after each of four episodes
     assert env.n_resets == 5
+
+
+def test_vec_normalize_learns_the_same_scale_where_dones_are_numbers():
+    scales = []
+    for wrap in (lambda env: env, Reused):
+        env = VecNormalize(wrap(make_vec_env(lambda: Corridor((2, 3)), 3, seed=0)), norm_obs=False)
+        make("steps", env).learn(48)
+        scales.append(float(env.ret_rms.var))
+    assert scales[0] == scales[1]
 
 
 class Succeeds(Corridor):
