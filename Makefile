@@ -42,6 +42,6 @@ wheel:
 
 # The oldest versions that pyproject.toml allows; matplotlib 3.8 warns of what pyparsing has deprecated since
 test-lowest:
-	uv venv --clear build/lowest
+	uv venv --clear --python 3.10 build/lowest
 	uv pip install --python build/lowest --resolution lowest-direct -e ".[tests]"
 	build/lowest/bin/python -m pytest -o filterwarnings=default

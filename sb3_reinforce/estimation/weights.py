@@ -58,7 +58,7 @@ def complete_rollout(
         actions=th.as_tensor(buffer.actions, device=policy.device),
         rewards=th.as_tensor(rewards).double(),
         dones=th.as_tensor(dones),
-        timesteps=th.as_tensor(timesteps),
+        timesteps=th.as_tensor(timesteps).long(),
         # A copy: PyTorch takes no array with negative strides
         used=th.as_tensor(used.copy()),
         returns=th.tensor(returns),
