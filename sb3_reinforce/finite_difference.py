@@ -62,9 +62,9 @@ class FiniteDifference(BasePolicyGradient):
         ``regression: [1 Δ] [u₀ ĝ]ᵀ ≈ U(θ+Δ)``
 
     (Peters and Schaal, 2008, section 3.1). No derivative of the policy is used, and returns are undiscounted. θ is the
-    actor's parameters, those that the action for an observation near 0 is computed from; the critic and ``log_std`` are
-    not searched. Different candidates act in different environments of one VecEnv: plain MLPs in one batched forward
-    pass, other policies one after the other.
+    actor's parameters, those that the action for an observation near 0 is computed from; ``log_std`` is not searched,
+    nor is the critic unless ``predict`` evaluates it. Different candidates act in different environments of one VecEnv:
+    plain MLPs in one batched forward pass, other policies one after the other.
 
     The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. The
     observations of an update are added to them afterwards. The first update uses the statistics of the first reset.

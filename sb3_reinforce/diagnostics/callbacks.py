@@ -47,11 +47,11 @@ class GradientQualityCallback(Diagnosis):
     ``train/r_squared``, ``train/residual_std``, ``train/standard_error``.
 
     A sample g is the gradient of one episode, or of the part of it in a fixed rollout. The estimates come from a single
-    rollout and are noisy if it has few episodes. With fewer than two only the cosine is logged, and while the actor is
-    frozen nothing. A measurement costs about one forward and one backward pass over at most ``max_episodes`` episodes
-    for an ``MlpPolicy``, two more with ``"optimal"``, and the same again for every 256 MiB that the gradients take. For
-    other policies it costs a backward pass for each episode and each baseline. Nothing is sampled for it, and training
-    is the same with and without it.
+    rollout and are noisy if it has few episodes. With fewer than two only the cosine is logged, and while REINFORCE's
+    actor is frozen nothing. A measurement costs about one forward and one backward pass over at most ``max_episodes``
+    episodes for an ``MlpPolicy``, two more with ``"optimal"``, and the same again for every 256 MiB that the gradients
+    take. For other policies it costs a backward pass for each episode and each baseline. Nothing is sampled for it, and
+    training is the same with and without it.
 
     :param every: Rollouts between two measurements
     :param baselines: Names or functions; ``"none"`` is always among them, and ``"value"`` needs a critic. A function

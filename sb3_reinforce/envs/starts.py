@@ -36,8 +36,10 @@ def start_episodes(env: VecEnv, seeds: NDArray[np.integer] | None) -> Any:
     for seed in np.unique(seeds).tolist():
         try:
             env.env_method("reset", seed=seed, indices=np.flatnonzero(seeds == seed).tolist())
-        # Some VecEnvs pass the indices on to the environment
         except (NotImplementedError, TypeError) as error:
+            # Some VecEnvs pass the indices on to an environment, which does not know them
+            if isinstance(error, TypeError) and "indices" not in str(error):
+                raise
             raise cannot_seed(base) from error
     return env.reset()
 

@@ -29,7 +29,7 @@ class Rollout:
     :param dones: Whether the step is the last of its episode (terminated or truncated), bool
     :param timesteps: t within the episode, int64
     :param used: Whether the step enters the gradient (m_t), bool
-    :param returns: G_t, float64; known only where ``used``, elsewhere only the part of the sum that lies in the rollout
+    :param returns: G_t, float64; known only where ``used``; elsewhere the sum is not complete
     :param discounts: The factor of the score besides G_t − b_t: γ^t with ``discount_scores`` and
         ``reward_to_go``, else 1; float64
     :param values: V(s_t) by the critic before this rollout trained it, float64; None without ``baseline="value"``

@@ -46,7 +46,7 @@ class NoGradient(ActorCriticPolicy):
             return super().get_distribution(obs)
 
 
-class ByHand(ActorCriticPolicy):
+class ByHand(NoGradient):
     """A policy that computes its actions itself, from transposed parameters and from a list of them."""
 
     def _predict(self, observation, deterministic=False):

@@ -301,7 +301,22 @@ class WithIndices(Wrapper):
 
 def test_environments_that_do_not_know_indices_cannot_be_seeded():
     model = FiniteDifference("LinearPolicy", WithIndices(make_vec_env("CartPole-v1", 2)), device="cpu")
-    with pytest.raises(ValueError, match="DummyVecEnv does not support it here"):
+    with pytest.raises(ValueError, match="Episodes can start from given seeds only where"):
+        model.learn(1)
+
+
+class WrongSeed(Counting):
+    """Fails where it is reset with a seed."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            raise TypeError("a mistake in reset")
+        return super().reset(seed=seed)
+
+
+def test_an_error_of_a_seeded_reset_is_the_users_own():
+    model = FiniteDifference("LinearPolicy", DummyVecEnv([WrongSeed]), device="cpu")
+    with pytest.raises(TypeError, match="a mistake in reset"):
         model.learn(1)
 
 
