@@ -185,7 +185,7 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     differentiated = parameters_of(rollout)
     if not wanted <= {*differentiated}:
         raise ValueError(
-            f"compare_estimators needs the gradient of log π for all parameters of the actor, and log π of "
+            "compare_estimators needs the gradient of log π for all parameters of the actor, and log π of "
             f"{type(rollout.policy).__name__} has none for some of them"
         )
     mask = th.cat([th.full((parameter.numel(),), parameter in wanted) for parameter in differentiated])
