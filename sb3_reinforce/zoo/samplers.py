@@ -17,12 +17,12 @@ def sample_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
 
     Configured ``policy_kwargs``, ``reward_to_go`` and ``episodes_per_start`` are replaced.
     """
-    return convert_reinforce(suggest_reinforce(trial, n_envs))
+    return convert_reinforce(suggest_reinforce(trial, n_actions, n_envs))
 
 
 def sample_reinforce_lstm(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
     """As ``sample_reinforce``, with a memory."""
-    sampled = suggest_reinforce(trial, n_envs)
+    sampled = suggest_reinforce(trial, n_actions, n_envs)
     sampled["memory"] = trial.suggest_categorical("memory", [*MEMORIES])
     sampled["lstm_hidden_size_pow"] = trial.suggest_int("lstm_hidden_size_pow", 4, 8)
     if sampled["baseline"] == "value":
@@ -30,8 +30,8 @@ def sample_reinforce_lstm(trial: optuna.Trial, n_actions: int, n_envs: int, addi
     return convert_reinforce_lstm(sampled)
 
 
-def suggest_reinforce(trial: optuna.Trial, n_envs: int) -> Settings:
-    """The values of a trial of REINFORCE."""
+def suggest_reinforce(trial: optuna.Trial, n_actions: int, n_envs: int) -> Settings:
+    """The values of a trial of REINFORCE; ``n_actions`` is 0 unless the actions are a Box."""
     sampled: Settings = {
         "baseline": trial.suggest_categorical("baseline", ["value", "leave_one_out", "time_mean", "optimal"]),
         "step": trial.suggest_categorical("step", ["optimizer", "natural"]),
@@ -41,6 +41,8 @@ def suggest_reinforce(trial: optuna.Trial, n_envs: int) -> Settings:
         "net_arch": trial.suggest_categorical("net_arch", ["tiny", "small", "medium"]),
         "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
     }
+    if n_actions > 0:
+        sampled["log_std_init"] = trial.suggest_float("log_std_init", -2.0, 1.0)
     if sampled["step"] == "natural":
         sampled["target_kl"] = trial.suggest_float("target_kl", 1e-3, 0.05, log=True)
     else:
@@ -68,6 +70,8 @@ def convert_reinforce(sampled_params: Settings) -> Settings:
     for name in ("n_steps", "n_episodes", "target_kl"):
         arguments.setdefault(name, None)
     arguments |= {"reward_to_go": True, "episodes_per_start": 1}
+    if "log_std_init" in arguments:
+        arguments["policy_kwargs"]["log_std_init"] = arguments.pop("log_std_init")
     if "n_episodes_pow" in arguments:
         arguments["n_episodes"] = 2 ** arguments.pop("n_episodes_pow")
     return arguments

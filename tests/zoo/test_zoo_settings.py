@@ -207,10 +207,10 @@ def test_optuna_tunes_and_its_trials_can_be_trained(name, tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
     tried = set()
     published = yaml.safe_load((HYPERPARAMS / f"{name}.yml").read_text())
-    for entry in ("CartPole-v1", "MountainCarContinuous-v0"):
+    for entry, n_actions in (("CartPole-v1", 0), ("MountainCarContinuous-v0", 1)):
         settings = published.get(entry, published["default"])
         fixed = {key: settings[key] for key in ("policy", "estimator", "n_top") if key in settings}
         if name != "finite_difference":
@@ -218,9 +218,11 @@ def test_every_sample_makes_a_model_and_can_be_made_again_from_its_trial(name):
             fixed |= {"reward_to_go": False, "episodes_per_start": 4}
         for _ in range(20):
             trial = study.ask()
-            sample = HYPERPARAMS_SAMPLER[name](trial, 1, 8, {})
+            sample = HYPERPARAMS_SAMPLER[name](trial, n_actions, 8, {})
             assert HYPERPARAMS_CONVERTER[name](trial.params) == sample
             if name != "finite_difference":
+                assert sample["policy_kwargs"].get("log_std_init") == trial.params.get("log_std_init")
+                assert ("log_std_init" in trial.params) == (n_actions > 0)
                 memory = sample["policy_kwargs"].get("memory")
                 tried.add((sample["baseline"], sample["step"], sample["n_steps"] is None, memory))
             model = ALGORITHMS[name](env=entry, device="cpu", **{**fixed, **sample})
