@@ -25,7 +25,7 @@ def filled(text: str) -> str:
 
 def computed(name: str) -> str:
     """A table, with empty lines around it, or a figure of a sentence."""
-    text = getattr(tuning if name == "chosen_on" else tables, name)()
+    text = getattr(tuning if name in ("chosen_on", "settings") else tables, name)()
     return f"\n\n{text}\n\n" if text.startswith("|") else text
 
 
