@@ -45,7 +45,7 @@ from sb3_reinforce.estimation.perturbations import (
 from sb3_reinforce.policies import parameters
 from sb3_reinforce.policies.linear import LinearPolicy
 from sb3_reinforce.policies.masks import MaskedPolicy
-from sb3_reinforce.sampling.normalization import check_scale, frozen
+from sb3_reinforce.sampling.normalization import frozen
 from sb3_reinforce.sampling.utility import EpisodicUtility, Stopped
 
 SelfFiniteDifference = TypeVar("SelfFiniteDifference", bound="FiniteDifference")
@@ -68,9 +68,7 @@ class FiniteDifference(BasePolicyGradient):
 
     The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. The
     observations of an update are added to them afterwards. The first update uses the statistics of the first reset.
-    Utilities are sums of the rewards before any scaling by it. If a custom wrapper above it may change rewards, they
-    are sums of that wrapper's rewards, and VecNormalize must not learn their scale (``norm_reward=False`` or
-    ``training=False``).
+    Utilities are sums of unscaled rewards. A wrapper above it gets unscaled rewards too.
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)
@@ -192,8 +190,6 @@ class FiniteDifference(BasePolicyGradient):
     def _check_arguments(self) -> list[th.nn.Parameter]:
         """Check the arguments as they are now, and choose ``n_delta`` if it is open; return what is searched."""
         check_finite_difference(self)
-        if self.env is not None:
-            check_scale(self.env)
         # Also where n_delta is given: an error if there is nothing to search
         searched = parameters.searched_parameters(self.policy)
         if self.n_delta is None:

@@ -39,7 +39,6 @@ from sb3_reinforce.policies.critic import fit_critic, rollout_values
 from sb3_reinforce.policies.evaluation import (
     Parameters,
     acting_log_prob,
-    actor_parameters,
     calls,
     evaluate,
     floor_std,
@@ -257,7 +256,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _critic_rate(self) -> float:
         if self.critic_learning_rate is None:
-            self._renew_lr_schedule()
             return self.lr_schedule(self._current_progress_remaining)
         return self._scheduled("critic_learning_rate")
 
@@ -286,9 +284,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def _sort_parameters(self, rollout: Rollout, batch: Batch) -> tuple[Parameters, Parameters, Parameters]:
         """Parameters of the actor, of the critic alone and of both; without a critic the last two are empty."""
         if rollout.values is None:
-            if self.step == "natural":
-                # A compiled network has gradients of 0 instead of None
-                return actor_parameters(self.policy, batch.observations, batch.actions), [], []
             return trainable(self.policy), [], []
         held = {parameter for group in self.critic_optimizer.param_groups for parameter in group["params"]}
         if not held.issuperset(self.policy.parameters()):
@@ -446,11 +441,11 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if rollout is None:
             raise ValueError("train needs a rollout: call learn, which collects one")
         ent_coef = self._scheduled("ent_coef")
+        self._update_learning_rate(self.policy.optimizer)
         critic_rate = self._critic_rate()
         batch = training_batch(rollout, self.rollout_buffer, self.normalize_advantage)
         actor, critic, shared = self._sort_parameters(rollout, batch)
         self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
 
         # The natural step bounds the policy's change, and the critic's error has no part in that
         trains_values = bool(shared) and self.step == "optimizer"

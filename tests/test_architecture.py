@@ -175,9 +175,9 @@ def test_diagnostics_read_only_what_is_public() -> None:
     private = [
         f"{path}:{node.lineno} {ast.unparse(node)}"
         for path, node in NODES
-        if entry_of(path) == "diagnostics"
-        and isinstance(node, ast.Attribute)
+        if isinstance(node, ast.Attribute)
         and PRIVATE.fullmatch(node.attr)
+        and entry_of(path) == "diagnostics"
         and not is_own(node.value)
     ]
     assert not private, "\n".join(private)

@@ -68,13 +68,10 @@ class BasePolicyGradient(Distributed):
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = self._checked("learning_rate")
 
-    def _renew_lr_schedule(self) -> None:
-        """Follow another learning rate that a callback has set, unless the user has replaced the schedule itself."""
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        # Another learning rate that a callback has set, unless the user has replaced the schedule itself
         if isinstance(self.lr_schedule, CheckedSchedule):
             self._setup_lr_schedule()
-
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        self._renew_lr_schedule()
         super()._update_learning_rate(optimizers)
 
     def _checked(self, name: str) -> Any:

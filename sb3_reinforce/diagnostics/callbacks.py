@@ -98,6 +98,7 @@ class GradientQualityCallback(Diagnosis):
         else:
             rollout = self.model.rollout
             actor = actor_parameters(rollout.policy, *first_step(rollout))
+            leave_no_graph(rollout.policy, *first_step(rollout))
             if not actor:
                 # It is frozen
                 self.thetas.clear()

@@ -18,7 +18,6 @@ from sb3_reinforce.policies.parameters import read, searched_parameters
 from sb3_reinforce.sampling.candidate_actors import make_candidate_actor
 from sb3_reinforce.sampling.candidates import CandidateStep, evaluate_candidates, seeds_of
 from sb3_reinforce.sampling.measurement import undisturbed
-from sb3_reinforce.sampling.normalization import unclipped
 
 
 class CandidateUtility:
@@ -70,7 +69,7 @@ class CandidateUtility:
         self.seed = int(seeds[-1, -1]) + 1
         limit = getattr(self.model, "max_episode_steps", 100_000)
         actor = make_candidate_actor(self.policy, self.parameters, self.env.num_envs, deterministic=False)
-        with undisturbed(self.model), unclipped(self.env), evaluation_mode(self.policy):
+        with undisturbed(self.model), evaluation_mode(self.policy):
             returns = evaluate_candidates(actor, self.env, candidates, seeds, self.n_episodes, limit, self._count)
         return th.as_tensor(returns).mean(1).reshape(thetas.shape[:-1])
 

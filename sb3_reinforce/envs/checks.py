@@ -71,8 +71,6 @@ def as_reward(reward: Any, env: int) -> float:
 
 def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
     """Check the form of one observation, which a VecEnv would silently broadcast, cut or round to its space."""
-    if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == space.shape and type(space) is spaces.Box:
-        return
     if isinstance(space, spaces.Dict):
         if not isinstance(obs, Mapping) or not obs.keys() >= space.spaces.keys():
             got = list(obs) if isinstance(obs, Mapping) else repr(obs)

@@ -29,7 +29,7 @@ from sb3_reinforce.policies.evaluation import (
     log_prob_of,
     trainable,
 )
-from sb3_reinforce.policies.plain_mlp import apply_temperature, plain_actor
+from sb3_reinforce.policies.plain_mlp import plain_actor, temperature_hook
 
 # Floats that an intermediate result may take, 128 MiB in float32
 CHUNK = 2**25
@@ -209,4 +209,5 @@ def trace(layers: list[nn.Module], x: th.Tensor) -> tuple[list[th.Tensor], list[
             outputs.append(x)
         else:
             x = layer(x)
-    return inputs, outputs, apply_temperature(layers[-1], x)
+    hook = temperature_hook(layers[-1])
+    return inputs, outputs, x if hook is None else hook(layers[-1], (), x)

@@ -205,14 +205,12 @@ def set_temperature(policy: ActorCriticPolicy, temperature: float) -> None:
     ``policy.save`` does not keep it, ``model.save`` does.
     """
     layer = getattr(policy, "action_net", None)
-    if layer is None:
-        if temperature != 1:
-            raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
-        return
-    hook = temperature_hook(layer)
+    hook = None if layer is None else temperature_hook(layer)
     if hook is None:
         if temperature == 1:
             return
+        if layer is None:
+            raise ValueError(f"temperature needs a policy with an action_net, and {type(policy).__name__} has none")
         hook = DivideLogits(th.ones((), dtype=th.float32, device=policy.device))
         layer.register_forward_hook(hook)
     # The policy may have been moved since

@@ -138,12 +138,6 @@ def takes_vectors(policy: ActorCriticPolicy, extractor: nn.Module) -> bool:
     return is_flat and is_plain_extractor(extractor)
 
 
-def apply_temperature(head: nn.Module, outputs: th.Tensor) -> th.Tensor:
-    """The outputs over τ, if the last layer has a temperature."""
-    hook = temperature_hook(head)
-    return outputs if hook is None else hook(head, (), outputs)
-
-
 def numpy_layers(
     policy: ActorCriticPolicy, base: type[ActorCriticPolicy] = ActorCriticPolicy
 ) -> list[nn.Module] | None:

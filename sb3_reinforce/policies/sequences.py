@@ -144,7 +144,6 @@ class RecurrentPolicy(ActorCriticPolicy):
             network = th.backends.cudnn.flags(enabled=False)(lambda *inputs: recurrence(*inputs))
         n_at_once = max(1, FLOATS // (GATES * index.shape[1] * recurrence.hidden_size))
         outputs = []
-        places = []
         for part, is_part in zip(th.split(index, n_at_once), th.split(is_row, n_at_once), strict=True):
             n_running = int(is_part[0].sum())
             part = part[:, :n_running]
@@ -157,9 +156,8 @@ class RecurrentPolicy(ActorCriticPolicy):
                 # The gates of long episodes are computed again for the backward pass: exact, in less memory
                 output, state = checkpoint(network, features[part], state, use_reentrant=False)
             outputs.append(output[is_part])
-            places.append(part[is_part])
         remembered = th.cat(outputs)
-        return th.empty_like(remembered).index_copy(0, th.cat(places), remembered)
+        return th.empty_like(remembered).index_copy(0, index[is_row], remembered)
 
     @th.no_grad()
     def state_after(self, rows: Rows) -> th.Tensor:

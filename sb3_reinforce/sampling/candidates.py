@@ -21,7 +21,7 @@ from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.checks import check_finite, check_length
 from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
-from sb3_reinforce.sampling.normalization import original_reward_of
+from sb3_reinforce.sampling.normalization import unscaled_step
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -104,7 +104,6 @@ def evaluate_candidates(
     on_step: Callable[[CandidateStep], None],
 ) -> np.ndarray:
     """Unscaled returns Σ_t r_t of candidates ``(m, n)``, shape ``(m, n_episodes)``; ``seeds`` has this shape too."""
-    original, _ = original_reward_of(env)
     returns = np.zeros((len(thetas), n_episodes))
     if seeds is not None:
         # Pending seeds, as make_vec_env(..., seed=...) leaves them, would replace the seeds of the first round
@@ -127,8 +126,8 @@ def evaluate_candidates(
                 started = []
             actions = actor.act(obs)
             check_finite("The policy's action", actions, (None,))
-            obs, rewards, dones, infos = env.step(actions)
-            tracker.add(rewards if original is None else original(), obs)
+            obs, rewards, dones, infos = unscaled_step(env, actions)
+            tracker.add(rewards, obs)
             # Some VecEnvs give numbers
             dones = np.asarray(dones, dtype=bool)
             finished = dones & tracker.active

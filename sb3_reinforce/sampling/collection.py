@@ -128,14 +128,12 @@ def collect(
         clipped_actions = as_env_actions(actions)
         new_obs, rewards, dones, infos = env.step(clipped_actions)
         model.num_timesteps += env.num_envs
-        try:
-            if has_callback:
-                callback.update_locals(locals())
-                if not goes_on(callback):
-                    return None
-        finally:
-            # As with A2C, the callback finds s_t here. If it fails, s_{t+1} is kept
-            model._last_obs = new_obs  # type: ignore[assignment]
+        if has_callback:
+            callback.update_locals(locals())
+            if not goes_on(callback):
+                return None
+        # As with A2C, the callback finds s_t here
+        model._last_obs = new_obs  # type: ignore[assignment]
         # After the callback, which may have changed the rewards in place
         rollout_buffer.rewards[n_steps] = rewards
         # Copies as booleans: some VecEnvs return numbers, or reuse the array

@@ -1,30 +1,14 @@
 """VecNormalize during a comparison: one scale for all candidates, which learns from all steps afterwards."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import cast
 
 import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import (
-    VecCheckNan,
-    VecEnv,
-    VecEnvWrapper,
-    VecExtractDictObs,
-    VecFrameStack,
-    VecMonitor,
-    VecNormalize,
-    VecTransposeImage,
-    VecVideoRecorder,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_reinforce.common.moments import normalizers, observation_moments
-
-# By the method, since a subclass may have another one
-KEEP_REWARDS = {
-    wrapper.step_wait
-    for wrapper in (VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage, VecVideoRecorder)
-}
 
 
 class ObservationStatistics:
@@ -54,25 +38,16 @@ class ObservationStatistics:
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
 
-def original_reward_of(env: VecEnv) -> tuple[Callable[[], np.ndarray] | None, VecEnv]:
-    """The method for rewards that VecNormalize has not scaled, or None; and the first VecEnv that may change them."""
-    found = None
-    while isinstance(env, VecNormalize) or type(env).step_wait in KEEP_REWARDS:
-        if isinstance(env, VecNormalize) and env.norm_reward:
-            found = env.get_original_reward
-        env = cast(VecEnvWrapper, env).venv
-    return found, env
-
-
-def check_scale(env: VecEnv) -> None:
-    """Refuse a VecNormalize whose scale of the rewards is used, but would never be learned."""
-    original, changing = original_reward_of(env)
-    if original is None and any(each.training and each.norm_reward for each in normalizers(env)):
-        raise ValueError(
-            f"{type(changing).__name__} lies above VecNormalize and may change rewards. FiniteDifference compares "
-            "candidates at a frozen scale, which VecNormalize would never learn: set norm_reward=False, or "
-            "training=False once the scale is learned"
-        )
+def unscaled_step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
+    """Step the environments while no VecNormalize scales rewards."""
+    scaling = [each for each in normalizers(env) if each.norm_reward]
+    try:
+        for each in scaling:
+            each.norm_reward = False
+        return env.step(actions)
+    finally:
+        for each in scaling:
+            each.norm_reward = True
 
 
 @contextmanager

@@ -174,11 +174,6 @@ def test_candidates_sample_only_on_request(deterministic):
     assert (len(estimate.utilities.unique()) == 1) == deterministic
 
 
-def test_it_learns_the_line():
-    model = make(make_vec_env(Line, 8), estimator="regression", n_delta=8, learning_rate=0.1).learn(1500)
-    assert float(model.theta) == pytest.approx(3, abs=0.2)
-
-
 def test_an_update_is_finished_and_none_starts_after_the_end():
     starts = Record(lambda model: model.num_timesteps, at="rollout_start")
     model = make().learn(300, starts)

@@ -4,6 +4,7 @@ import pytest
 import torch as th
 from callbacks import At
 from environments import Corridor
+from gymnasium import spaces
 from models import FromDistribution, all_kinds, make
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -49,7 +50,7 @@ class Column(ActorCriticPolicy):
 @pytest.mark.parametrize("kwargs", [{}, {"step": "natural"}, {"baseline": "none"}], ids=str)
 def test_a_log_prob_of_the_wrong_shape_is_named(kwargs):
     """Multiplied by n weights it would be an n × n matrix."""
-    model = REINFORCE(Column, "Pendulum-v1", max_episode_steps=200, device="cpu", **kwargs)
+    model = REINFORCE(Column, Corridor(action_space=spaces.Box(-1, 1, (1,))), device="cpu", **kwargs)
     before = to_vector(model.policy.parameters())
     sentence = r"log π of Column must have shape \(n,\), got \(\d+, 1\)"
     for use in (lambda: model.learn(1), lambda: check_gradient(model)):

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from callbacks import Record
 from enumeration import GAMMA, assert_equal, complete, expectation
-from environments import Corridor, Random, Reused
+from environments import Corridor, Random
 from gymnasium import spaces
 from models import plain
 from recurrent_models import SPACES, by_steps, make_recurrent, set_n_steps
@@ -247,16 +247,6 @@ def test_cudnn_is_not_asked_for_gradients_in_evaluation_mode(monkeypatch):
     model = make_recurrent(double=False, n_episodes=4, baseline="optimal", policy_kwargs=network).learn(20)
     compare_baselines(model, n_episodes=4, n_resamples=2)
     assert (True, False) in passes and (True, True) not in passes
-
-
-@pytest.mark.parametrize("n_steps", [7, None])
-def test_a_vec_env_may_reuse_its_arrays(n_steps):
-    ends = []
-    for wrap in (Reused, lambda env: env):
-        env = make_vec_env(lambda: Corridor((3, 5), lambda t, action: float(action)), 2, seed=0)
-        model = make_recurrent(env=wrap(env), double=False, n_steps=n_steps).learn(60)
-        ends.append(plain(model.policy.state_dict()))
-    assert ends[0] == ends[1]
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.5])

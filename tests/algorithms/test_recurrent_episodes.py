@@ -119,18 +119,6 @@ def test_episodes_go_on_after_an_error_at_the_start_of_a_rollout():
     assert not model.rollout_buffer.episode_starts[0].any()
 
 
-def test_episodes_without_their_memory_are_reset():
-    """A rollout of whole episodes keeps no states, and its last episodes are cut."""
-    env = make_vec_env(lambda: Corridor((3, 7)), 2, seed=0)
-    model = RecurrentREINFORCE("MlpLstmPolicy", env, n_episodes=3, seed=0, device="cpu").learn(1)
-    assert not all(model._last_episode_starts)
-    set_n_steps(model)
-    starts = Record(lambda model: model.rollout_buffer.episode_starts[0].all())
-    model.learn(40, starts, reset_num_timesteps=False)
-    assert starts.records[0]
-    assert not all(starts.records)
-
-
 def test_episodes_go_on_with_their_memory_after_an_error_at_the_end_of_a_rollout():
     env = make_vec_env(lambda: Corridor((40,)), 2, seed=0)
     model = RecurrentREINFORCE("MlpLstmPolicy", env, n_steps=5, learning_rate=0.0, seed=0, device="cpu")

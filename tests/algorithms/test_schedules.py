@@ -93,29 +93,9 @@ def test_temperature_may_fall_to_zero_before_the_end():
     assert temperatures.records == pytest.approx([1.0, 0.5, 1e-3, 1e-3])
 
 
-def test_temperature_may_fall_to_zero(tmp_path):
-    """As "linearly to 0" does: the last policy is its own mode, and so is a model loaded at the end."""
-    model = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, temperature=LinearSchedule(1.0, 0.0, 1.0), device="cpu")
-    with th.no_grad():
-        model.policy.action_net.weight.normal_()
-    model.learn(320)
-    model.save(tmp_path / "cold")
-    cold = REINFORCE.load(tmp_path / "cold", env=model.env)
-    obs = th.randn(200, 4).numpy()
-    sampled, mode = (cold.predict(obs, deterministic=deterministic)[0] for deterministic in (False, True))
-    assert len(set(mode)) == 2 and (sampled == mode).all()
-    cold.learn(64)
-    assert all(parameter.isfinite().all() for parameter in cold.policy.parameters())
-
-
 @pytest.mark.parametrize("use_sde", [True, False])
-def test_min_std_is_a_floor_at_each_step_and_after_a_load(use_sde, tmp_path):
+def test_min_std_is_a_floor_after_a_load(use_sde, tmp_path):
     low = {"policy_kwargs": {"log_std_init": -3.0}, "use_sde": use_sde}
-    kwargs = {"min_std": 0.6, "learning_rate": 0.5, **low}
-    model = REINFORCE("MlpPolicy", "Pendulum-v1", n_steps=16, **kwargs)
-    stds = Record(lambda model: model.policy.log_std.exp().min().item(), at="step")
-    model.learn(160, callback=stds)
-    assert min(stds.records) >= 0.6 - 1e-6 and model.logger.name_to_value["train/std"] >= 0.6 - 1e-6
     REINFORCE("MlpPolicy", "Pendulum-v1", **low).save(tmp_path / "model")
     model = REINFORCE.load(tmp_path / "model", env=gym.make("Pendulum-v1"), min_std=0.5, learning_rate=0.0)
     assert model.learn(32).policy.log_std.exp().min().item() == pytest.approx(0.5)
@@ -133,6 +113,7 @@ def test_a_floor_follows_its_schedule(use_sde, tmp_path):
     assert stds.records == pytest.approx([0.8] * 16 + [0.7] * 16 + [0.6] * 16 + [0.5] * 16)
     # A model that is saved has the floor of the progress made
     assert model.policy.log_std.exp().mean().item() == pytest.approx(0.4)
+    assert model.logger.name_to_value["train/std"] == pytest.approx(0.4)
     model.save(tmp_path / "model")
     model = REINFORCE.load(tmp_path / "model", env=model.env)
     narrow(model)

@@ -112,7 +112,9 @@ USED_BEFORE = {
 def test_a_wrong_value_that_is_set_later_is_named_before_it_is_used(kind, name, at):
     model = make(kind).learn(16)
     before, n_steps = deepcopy(model.get_parameters()), model.num_timesteps
-    for value in wrong_values(name, TABLES[type(model)][name]):
+    values = wrong_values(name, TABLES[type(model)][name])
+    # One of another kind and the last, for numbers one out of range: all are tried at construction
+    for value in (values[0], values[-1]):
         given = getattr(model, name)
         change = Record(lambda model, value=value: setattr(model, name, value), "rollout_start")
         if at == "before":
@@ -157,10 +159,8 @@ RECURRENT, MASKABLE = (
     [
         ("steps", {"baseline": "average"}, ["baseline", "'average'", "'leave_one_out'", "'optimal'", "'time_mean'"]),
         ("search", {"estimator": "backward"}, ["estimator", "'backward'", "'central'"]),
-        ("search", {"perturbation": "cube"}, ["perturbation", "'cube'", "'sphere'"]),
         ("steps", {"baseline": "leave-one-out"}, ["'leave-one-out': did you mean 'leave_one_out'?"]),
         ("search", {"estimator": "Central"}, ["'Central': did you mean 'central'?"]),
-        ("search", {"perturbation": "gausian"}, ["'gausian': did you mean 'gaussian'?"]),
         ("steps", {"normalize_by": "step"}, ["'step': did you mean 'steps'?"]),
         ("steps", {"policy": "MLPPolicy"}, ["policy", "'CnnPolicy'", "'MLPPolicy': did you mean 'MlpPolicy'?"]),
         ("search", {"policy": "NoPolicy"}, ["policy", "'LinearPolicy'", "'CnnPolicy'", "'NoPolicy'"]),
@@ -178,7 +178,6 @@ RECURRENT, MASKABLE = (
         ("steps", {"gae_lambda": 0.9, "reward_to_go": False}, ["gae_lambda=0.9", "reward_to_go=False"]),
         ("episodes", {"baseline": "optimal", "n_episodes": 1}, ["n_episodes", "at least 2", "'optimal'", "compares"]),
         ("episodes", {"baseline": "leave_one_out", "n_episodes": 1}, ["at least 2", "'leave_one_out'"]),
-        ("episodes", {"baseline": "time_mean", "n_episodes": 1}, ["at least 2", "'time_mean'"]),
         ("episodes", {"baseline": BASELINES["time_mean"], "n_episodes": 1}, ["at least 2", "'time_mean'"]),
         ("steps", {"min_std": 0.1}, ["min_std=0.1", "Discrete"]),
         ("steps", {"min_std": lambda progress: 0.0}, ["min_std=<function", "Discrete"]),

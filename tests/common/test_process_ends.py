@@ -53,7 +53,7 @@ INTERRUPTED = "KeyboardInterrupt"
 STOPS = {
     "callback returns False": (0, "callback", lambda model: False, (None, None), KINDS),
     "callback raises": (0, "callback", fail, (OSError("broken"), named(0, "OSError: broken")), ["steps"]),
-    "environment raises": (1, "step", fail, (named(1, "OSError: broken"), OSError("broken")), KINDS),
+    "environment raises": (1, "step", fail, (named(1, "OSError: broken"), OSError("broken")), ["steps", "search"]),
     "SIGINT": (1, "step", partial(send, signal.SIGINT), (named(1, INTERRUPTED), KeyboardInterrupt()), ["steps"]),
     "SIGTERM": (0, "step", partial(send, signal.SIGTERM), (KeyboardInterrupt(), named(0, INTERRUPTED)), ["search"]),
     "SIGKILL": (1, "step", partial(send, signal.SIGKILL), (DEAD, None), ["steps", "search"]),

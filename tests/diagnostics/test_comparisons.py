@@ -16,7 +16,6 @@ from sb3_reinforce.diagnostics import (
     baseline_comparison,
     compare_baselines,
     compare_starts,
-    gradient_statistics,
     gradients_by_episode,
     sample,
 )
@@ -89,9 +88,8 @@ def test_the_bandit_has_its_known_variances(better):
 
 def test_with_scores_of_one_length_optimal_is_the_mean_of_the_others():
     """r_i − r̄ is (N − 1)/N times r_i less the mean of the others: the ratio is the same number in every resample."""
-    for n in (20, 2000):
-        ratio = compare_baselines(bandit(), n, reference="mean", n_resamples=20)["optimal"].ratio
-        assert (ratio.low, ratio.value, ratio.high) == pytest.approx(3 * ((n / (n - 1)) ** 2,), rel=1e-4)
+    ratio = compare_baselines(bandit(), 20, reference="mean", n_resamples=20)["optimal"].ratio
+    assert (ratio.low, ratio.value, ratio.high) == pytest.approx(3 * ((20 / 19) ** 2,), rel=1e-4)
 
 
 def test_the_floor_is_the_best_constant_of_each_component():
@@ -198,16 +196,3 @@ def test_a_table_becomes_a_data_frame_if_there_is_pandas(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pandas"):
         table.to_pandas()
-
-
-@pytest.mark.slow
-def test_episodes_with_new_noise_at_each_step_are_independent():
-    """The mean of 20 episodes varies over repetitions as their own variance says, tr Σ / 20."""
-    model = REINFORCE("MlpPolicy", Corridor(action_space=BOX), use_sde=True, sde_sample_freq=1, device="cpu", seed=0)
-    table = compare_baselines(model, 400, ["none"], n_resamples=10)
-    means = []
-    for _ in range(60):
-        rollout = sample(model, 20)
-        means.append(gradients_by_episode(rollout, rollout.returns)[0].double().mean(0))
-    between = gradient_statistics(th.stack(means), confidence=0.999).variance
-    assert between.low < table["none"].variance.value / 20 < between.high

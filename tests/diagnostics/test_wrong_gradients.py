@@ -214,16 +214,15 @@ class Warm(ActorCriticPolicy):
         return actions, values, self.evaluate_actions(obs, actions)[1]
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_actions_that_are_sampled_with_other_probabilities_are_seen(seed):
+def test_actions_that_are_sampled_with_other_probabilities_are_seen():
     for policy, is_right in ((PartlyUniform, False), ("MlpPolicy", True)):
-        model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=seed)
+        model = REINFORCE(policy, corridor(spaces.Discrete(3)), baseline="mean", device="cpu", seed=0)
         with th.no_grad():
             model.policy.action_net.bias[0] = 2.0
-        assert check_gradient(model, seed=seed).failures == ([] if is_right else ["sampling"])
+        assert check_gradient(model, seed=0).failures == ([] if is_right else ["sampling"])
     for policy, action_space in ((Warm, spaces.Box(-1, 1, (2,))), (Mode, spaces.Discrete(3))):
-        model = REINFORCE(policy, corridor(action_space), baseline="mean", device="cpu", seed=seed)
-        assert "sampling" in check_gradient(model, seed=seed).failures
+        model = REINFORCE(policy, corridor(action_space), baseline="mean", device="cpu", seed=0)
+        assert "sampling" in check_gradient(model, seed=0).failures
 
 
 # Without a least deviation the second measurement fails at the latest, and with one sample the first case's 34th

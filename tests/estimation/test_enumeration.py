@@ -23,13 +23,11 @@ from sb3_reinforce.estimation import baselines
 from sb3_reinforce.estimation.baselines import score_products
 
 
-# The full tree has 256 batches of four, the ragged one 81
 @pytest.mark.parametrize(
     ("baseline", "n_episodes", "ragged"),
     [
         *product(["none", "leave_one_out"], [2], [False, True]),
         *product(["optimal"], [3], [False, True]),
-        pytest.param("optimal", 4, True, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("reward_to_go", [False, True])
@@ -101,11 +99,6 @@ def test_mean_is_biased_as_documented():
     assert_equal(expected_gradient(model), without - true_gradient(trajectories_of(model), mean_return) / 2)
 
 
-def test_without_discounted_scores_the_gradient_is_another():
-    model = make_model(baseline="none", discount_scores=False)
-    assert (expected_gradient(model) - gradient_of_return(model)).abs().max() > 1e-2
-
-
 def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
     """The sum before the division is not; the ratio is not even parallel to ∇E[G_0]."""
     model = make_model(ragged=True, baseline="none", normalize_by="steps")
@@ -116,11 +109,6 @@ def test_dividing_by_steps_is_biased_where_lengths_depend_on_actions():
     gradient = expected_gradient(model)
     assert_equal(expected_gradient(model, statistic=sum_of), 2 * gradient_of_return(model))
     assert th.cosine_similarity(gradient.flatten(), gradient_of_return(model).flatten(), dim=0) < 1 - 1e-4
-
-
-def test_dividing_by_steps_only_rescales_where_lengths_are_equal():
-    model = make_model(baseline="none", normalize_by="steps")
-    assert_equal(2 * expected_gradient(model), gradient_of_return(model))
 
 
 @pytest.mark.parametrize("numbers_at_once", [baselines.CHUNK, 1])

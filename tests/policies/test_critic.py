@@ -1,6 +1,7 @@
 """Where V comes from, and that a features extractor is evaluated no more often than it must be."""
 
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -93,16 +94,11 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(
-    ("policy", "kwargs", "change"),
-    [
-        *((ActorCriticPolicy, {}, change) for change in CHANGES),
-        (ActorCriticCnnPolicy, {}, "none"),
-        (ActorCriticCnnPolicy, {}, "class"),
-    ],
+    ("policy", "change"), [*product([ActorCriticPolicy], CHANGES), *product([ActorCriticCnnPolicy], ["none", "class"])]
 )
-def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, kwargs, change):
+def test_values_are_those_of_a_policy_as_the_user_has_changed_it(policy, change):
     """Along with the actions, or in one batch."""
-    model = make(policy, learning_rate=0.0, policy_kwargs=kwargs)
+    model = make(policy, learning_rate=0.0)
     CHANGES[change](model.policy)
     buffer = model.learn(1).rollout_buffer
     with th.no_grad():

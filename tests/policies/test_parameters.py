@@ -108,7 +108,7 @@ def test_linear_policy_refuses_hidden_layers() -> None:
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
+def test_parameters_move_between_the_algorithms(env_id: str) -> None:
     reinforce = REINFORCE("MlpPolicy", env_id, seed=0)
     search = FiniteDifference("MlpPolicy", env_id, estimator="central", n_delta=1, seed=1)
     obs = gym.make(env_id).observation_space.sample()
@@ -122,10 +122,6 @@ def test_parameters_move_between_the_algorithms(env_id: str, tmp_path) -> None:
     search.learn(1)
     reinforce.set_parameters(search.get_parameters(), exact_match=False)
     assert np.array_equal(*actions())
-    reinforce.save(tmp_path / "model")
-    other = FiniteDifference("MlpPolicy", env_id, estimator="central", n_delta=1, seed=2)
-    other.set_parameters(str(tmp_path / "model"), exact_match=False)
-    assert th.equal(other.theta, search.theta)
 
 
 @pytest.mark.parametrize("ortho_init", [True, False])

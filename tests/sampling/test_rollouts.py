@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch as th
 from callbacks import Record
-from environments import Corridor, Faulty, Reused
+from environments import Corridor, Faulty, Reused, Wrapper
 from gymnasium.wrappers import TimeLimit
 from models import all_kinds, make
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.common.spaces import as_policy_actions
@@ -34,13 +34,6 @@ def test_episodes_are_shared_out_evenly_and_begin_with_the_rollout(n_episodes, n
         quota = (rollout.used & rollout.dones).sum(0)
         assert quota.sum() == n_episodes and quota.max() - quota.min() <= 1
         assert rollout.timesteps[0].tolist() == [0] * n_envs
-
-
-def test_whole_episodes_begin_with_a_reset_where_the_user_has_stepped_the_environment():
-    model = make_model(lambda: Corridor((3,)), n_episodes=2, baseline="none").learn(6)
-    model.env.step(np.zeros(1, dtype=int))
-    model.learn(1, reset_num_timesteps=False)
-    assert model.rollout_buffer.observations[:, 0].argmax(-1).tolist() == [0, 1, 2] * 2
 
 
 def test_environments_that_have_all_ended_an_episode_are_not_reset_again():
@@ -76,10 +69,7 @@ def test_successes_are_those_of_the_episodes_that_count(kind):
     assert list(model.ep_success_buffer) == [True] * lengths.count(9) != []
 
 
-def test_a_monitor_may_refuse_the_reset_that_whole_episodes_begin_with():
-    envs = [partial(Monitor, gym.make("CartPole-v1"), allow_early_resets=False) for _ in range(2)]
-    with pytest.raises(RuntimeError, match="Tried to reset an environment before done"):
-        REINFORCE("MlpPolicy", DummyVecEnv(envs), n_episodes=2, seed=0, device="cpu").learn(1000)
+def test_a_monitor_that_refuses_early_resets_is_enough_for_fixed_rollouts():
     envs = [partial(Monitor, gym.make("CartPole-v1"), allow_early_resets=False) for _ in range(2)]
     assert REINFORCE("MlpPolicy", DummyVecEnv(envs), n_steps=16, device="cpu").learn(32).num_timesteps == 32
 
@@ -184,20 +174,14 @@ def test_the_critic_stands_in_at_a_cut_and_a_time_limit_and_never_after_a_termin
     np.testing.assert_allclose(model.rollout_buffer.returns.ravel(), expected)
 
 
-class WithoutTerminalObservation(VecEnvWrapper):
+class WithoutTerminalObservation(Wrapper):
     """Says that a time limit ended an episode, but not with which observation."""
 
-    def reset(self):
-        return self.venv.reset()
-
     def step_wait(self):
-        obs, rewards, dones, infos = self.venv.step_wait()
-        return (
-            obs,
-            rewards,
-            dones,
-            [{key: info[key] for key in info.keys() - {"terminal_observation"}} for info in infos],
-        )
+        obs, rewards, dones, infos = super().step_wait()
+        for info in infos:
+            info.pop("terminal_observation", None)
+        return obs, rewards, dones, infos
 
 
 def test_a_time_limit_without_an_observation_is_an_end_as_in_a2c():
