@@ -35,7 +35,7 @@ from sb3_reinforce.finite_difference import FiniteDifference
 from sb3_reinforce.policies.parameters import searched_parameters
 from sb3_reinforce.reinforce import REINFORCE
 from sb3_reinforce.sampling.measurement import sampling_copy, undisturbed
-from sb3_reinforce.sampling.normalization import unclipped
+from sb3_reinforce.sampling.normalization import unscaled
 
 LIKELIHOOD_RATIO = "likelihood_ratio"
 
@@ -173,8 +173,8 @@ def likelihood_ratio(model: REINFORCE | FiniteDifference, n_episodes: int) -> tu
     collector.reward_to_go = True
     collector.discount_scores = False
     collector.max_episode_steps = model.max_episode_steps
-    # As the utility, the rewards have no bound
-    with undisturbed(model), unclipped(model.env):
+    # As the rewards of the utility
+    with undisturbed(model), unscaled(model.env):
         reseed(env_of(model), int(th.randint(2**31, ())))
         rollout = collect_episodes(collector)
         # Training would go on from the same starts after each comparison

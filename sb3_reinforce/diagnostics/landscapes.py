@@ -29,8 +29,8 @@ class CandidateUtility:
     uses new ones.
 
     Call it with candidates of shape ``(k, n)`` or ``(m, k, n)``. It returns their utilities, ``(k,)`` or ``(m, k)``,
-    float64. ``theta`` has the model's own parameters, ``(n,)``. Each call leaves the environments at the start of an
-    episode, with new seeds from NumPy's global generator.
+    float64. ``theta`` has the model's own parameters, ``(n,)``. Rewards are not scaled by VecNormalize. Each call
+    leaves the environments at the start of an episode, with new seeds from NumPy's global generator.
 
     :param model: A model with an actor-critic policy and environments
     :param n_episodes: Episodes per utility

@@ -21,7 +21,7 @@ from sb3_reinforce.common.tensors import stack, take
 from sb3_reinforce.envs.checks import check_finite, check_length
 from sb3_reinforce.envs.starts import are_alike, start_episodes
 from sb3_reinforce.sampling.candidate_actors import CandidateActor
-from sb3_reinforce.sampling.normalization import unscaled_step
+from sb3_reinforce.sampling.normalization import unscaled
 
 Pair: TypeAlias = tuple[int, int]  # (candidate, episode)
 
@@ -126,7 +126,8 @@ def evaluate_candidates(
                 started = []
             actions = actor.act(obs)
             check_finite("The policy's action", actions, (None,))
-            obs, rewards, dones, infos = unscaled_step(env, actions)
+            with unscaled(env):
+                obs, rewards, dones, infos = env.step(actions)
             tracker.add(rewards, obs)
             # Some VecEnvs give numbers
             dones = np.asarray(dones, dtype=bool)

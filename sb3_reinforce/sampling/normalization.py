@@ -3,10 +3,8 @@
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_reinforce.common.moments import normalizers, observation_moments
 
@@ -38,26 +36,17 @@ class ObservationStatistics:
                 seen.update(obs[key] if isinstance(obs, dict) else obs)
 
 
-def unscaled_step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
-    """Step the environments while no VecNormalize scales rewards."""
+@contextmanager
+def unscaled(env: VecEnv | None) -> Iterator[None]:
+    """Let no VecNormalize scale or clip rewards in the block."""
     scaling = [each for each in normalizers(env) if each.norm_reward]
     try:
         for each in scaling:
             each.norm_reward = False
-        return env.step(actions)
+        yield
     finally:
         for each in scaling:
             each.norm_reward = True
-
-
-@contextmanager
-def unclipped(env: VecEnv | None) -> Iterator[None]:
-    """Let no VecNormalize clip rewards in the block, so that their sums are multiples of the utility."""
-    with ExitStack() as undo:
-        for each in normalizers(env):
-            undo.callback(setattr, each, "clip_reward", each.clip_reward)
-            each.clip_reward = np.inf
-        yield
 
 
 @contextmanager

@@ -87,10 +87,13 @@ def test_a_temperature_that_a_callback_sets_at_the_start_of_a_rollout_acts_in_it
     assert temperatures.records == pytest.approx([5.0] * 4 + [9.0] * 4)
 
 
-def test_temperature_may_fall_to_zero_before_the_end():
+def test_temperature_may_fall_to_zero_before_the_end(tmp_path):
+    """A loaded model acts at the last temperature."""
     temperatures = Record(temperature_of)
-    make("steps", n_steps=16, temperature=LinearSchedule(1.0, 0.0, 0.5)).learn(64, callback=temperatures)
+    model = make("steps", n_steps=16, temperature=LinearSchedule(1.0, 0.0, 0.5)).learn(64, callback=temperatures)
     assert temperatures.records == pytest.approx([1.0, 0.5, 1e-3, 1e-3])
+    model.save(tmp_path / "model")
+    assert temperature_of(REINFORCE.load(tmp_path / "model", device="cpu")) == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("use_sde", [True, False])

@@ -366,14 +366,23 @@ def test_a_measurement_before_a_rollout_leaves_the_noise_of_gsde():
     th.testing.assert_close(*ends)
 
 
-def test_gradients_and_utilities_are_of_rewards_that_are_not_clipped():
-    """Also where a wrapper above VecNormalize may change rewards; the scale of a new VecNormalize is 1."""
+class Squared(Wrapper):
+    """Changes rewards."""
+
+    def step_wait(self):
+        obs, rewards, dones, infos = super().step_wait()
+        return obs, rewards**2, dones, infos
+
+
+def test_gradients_and_utilities_are_of_rewards_that_are_neither_clipped_nor_scaled():
+    """Also where a wrapper above VecNormalize changes rewards."""
     gradients = []
     utilities = []
-    for bound in (0.5, 10.0):
+    for bound, variance in ((0.5, 1.0), (10.0, 4.0)):
         env = VecNormalize(make_vec_env(lambda: Corridor((2,), lambda t, action: 3.0 * action), 2, seed=0))
         env.clip_reward = bound
-        model = REINFORCE("MlpPolicy", Wrapper(env), policy_kwargs={"net_arch": []}, device="cpu", seed=0)
+        env.ret_rms.var = np.array(variance)
+        model = REINFORCE("MlpPolicy", Squared(env), policy_kwargs={"net_arch": []}, device="cpu", seed=0)
         th.manual_seed(0)
         gradients.append(likelihood_ratio(model, 50)[0])
         utility = CandidateUtility(model, 50, seed=0)
