@@ -1,8 +1,8 @@
 # %% [markdown]
 # # What can go wrong, and how do you notice?
 #
-# `PitfallCallback` watches a run, changes nothing, and warns once about each of nine known pitfalls. In a healthy run
-# it is silent. Here is a run for each pitfall.
+# `PitfallCallback` watches a run, changes nothing, and warns once about each known pitfall. In a healthy run it is
+# silent. Here is a run for each pitfall.
 
 # %%
 import warnings

@@ -37,11 +37,27 @@ print(f"gradient {gradient:.2f}, θ: 0 → {theta:.3f}, π(Right): 0.5 → {1 / 
 assert round(gradient, 2) == 1.83 and round(theta, 3) == 0.183
 
 # %% [markdown]
+# The exact gradient of $U = 5 \sigma(\theta) - (1 - \sigma(\theta))$ at 0 is $6 / 4 = 1.5$. The rest is sampling noise.
+#
+# Programs do not write scores down. They differentiate the surrogate loss
+# $L = -\frac{1}{N} \sum_i R_i \log \pi_\theta(a_i)$, in which actions and returns are fixed numbers. Its gradient is
+# $-\hat g$. Its value means nothing: a smaller loss is not a better policy.
+
+# %%
+logit = th.zeros((), dtype=th.float64, requires_grad=True)
+log_probs = th.nn.functional.logsigmoid(th.stack([logit, -logit, logit]))
+(-(th.as_tensor(returns) * log_probs).mean()).backward()
+print(f"by automatic differentiation {-logit.grad.item():.2f}")
+assert abs(-logit.grad.item() - gradient) < 1e-9
+
+# %% [markdown]
 # ## By the package
 #
 # The same problem as an environment, with a policy that is linear in an observation that is always 1. Its parameters
 # are a weight and a bias for the logit of each action. `sample` plays three episodes, in which the actions and returns
-# above replace those that were drawn. The gradient of the weight of Right is then the one above.
+# above replace those that were drawn. `gradients_by_episode` returns $\sum_t w_t \nabla \log \pi(a_t \mid s_t)$ of each
+# episode, in one array for each choice of the weights $w$: here one. Its mean for the weight of Right is the gradient
+# above.
 
 
 # %%
@@ -114,10 +130,10 @@ assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.m
 # %% [markdown]
 # ## When all returns are positive
 #
-# Three actions with returns 8, 10 and 12. Without a baseline each episode pushes its action up, only by different
-# amounts. With the mean of the batch the action with the average return is left alone. The mean contains the return
-# that it is subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does
-# not.
+# Three actions with returns 8, 10 and 12, each taken once. (Only the returns of the sampled rollout are replaced, since
+# these baselines read nothing else.) Without a baseline each episode pushes its action up, only by different amounts.
+# With the mean of the batch the action with the average return is left alone. The mean contains the return that it is
+# subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does not.
 
 # %%
 rollout = replace(sample(make_model(8.0, 10.0, 12.0), 3), returns=th.tensor([[8.0], [10.0], [12.0]], dtype=th.float64))
@@ -139,3 +155,40 @@ none, centered = ((returns - baseline)[:, None] * scores for baseline in (0.0, 1
 for name, gradients in (("no baseline", none), ("baseline 10", centered)):
     print(f"{name}: mean {gradients.mean(0).round(3)}, variance {gradients.var(0).sum():.2f}")
 assert np.allclose(none.mean(0), centered.mean(0)) and none.var(0).sum() > 70 * centered.var(0).sum()
+
+# %% [markdown]
+# ## The whole algorithm
+#
+# Several states change little: the scores of all steps of an episode are weighted, each by the sum of the rewards that
+# follow it (page 5 says why). This is REINFORCE in PyTorch, on CartPole with a linear policy and without a baseline.
+
+
+# %%
+def play(env, policy):
+    """The log π and the reward of each step of an episode."""
+    log_probs, rewards = [], []
+    obs, _ = env.reset()
+    is_over = False
+    while not is_over:
+        pi = th.distributions.Categorical(logits=policy(th.as_tensor(obs)))
+        action = pi.sample()
+        obs, reward, terminated, truncated, _ = env.step(action.item())
+        log_probs.append(pi.log_prob(action))
+        rewards.append(reward)
+        is_over = terminated or truncated
+    return th.stack(log_probs), th.tensor(rewards)
+
+
+env, policy = gym.make("CartPole-v1"), th.nn.Linear(4, 2)
+env.reset(seed=seed)
+optimizer = th.optim.Adam(policy.parameters(), lr=0.1)
+means = []
+for _ in range(10):
+    episodes = [play(env, policy) for _ in range(16)]
+    loss = -sum((log_probs * rewards.flip(0).cumsum(0).flip(0)).sum() for log_probs, rewards in episodes) / 16
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    means.append(sum(len(rewards) for _, rewards in episodes) / 16)
+print("mean returns of ten rollouts:", [round(each) for each in means])
+assert means[-1] > 1.5 * means[0]

@@ -118,6 +118,7 @@ def fit(k):
     """The errors of the slopes, and their standard errors."""
     deltas = th.randn(k, 3, dtype=th.float64)
     utilities = (theta + deltas) @ slopes + th.randn(k, dtype=th.float64)
+    # The utilities are drawn once: fit_quality must see the same noise
     gradient = regression_gradient(lambda thetas: utilities, theta, deltas)
     return th.stack([gradient - slopes, fit_quality(theta + deltas, utilities, gradient).standard_error])
 

@@ -2,8 +2,10 @@
 # # Can a policy learn without a single derivative?
 #
 # `FiniteDifference` perturbs the parameters of a policy, looks at the returns of each perturbed policy and fits a plane
-# to them. The slope of the plane estimates the gradient of the utility, smoothed over the perturbations. It needs no
-# $\nabla \log \pi$, so the policy may be deterministic.
+# to them. The slope of the plane estimates the gradient of the utility, smoothed over the perturbations. The slope is
+# divided by the standard deviation of the returns and multiplied by that of the perturbations, so that the scale of the
+# rewards does not matter, and Adam takes the step. The search needs no $\nabla \log \pi$, so the policy may be
+# deterministic.
 
 # %%
 import torch as th
@@ -66,7 +68,7 @@ n, generator = 10, th.Generator().manual_seed(seed)
 
 
 def variance(name, k):
-    """tr (ΔᵀΔ)⁻¹, the median of 200 draws."""
+    """tr (ΔᵀΔ)⁻¹ = Σ 1 / s², with the singular values s of Δ: the median of 200 draws."""
     draws = [PERTURBATIONS[name](k, n, generator) for _ in range(200)]
     return th.stack([th.linalg.svdvals(deltas).pow(-2).sum() for deltas in draws]).median().item()
 

@@ -2,8 +2,9 @@
 # # Which rewards can an action change?
 #
 # Only those that come after it. REINFORCE may weight the score of step $t$ by the return of the whole episode, or by
-# the reward-to-go $G_t = \sum_{k \geq t} \gamma^{k-t} r_k$. For $\gamma = 1$ the expected gradient is the same; the
-# variance is not.
+# the reward-to-go $G_t = \sum_{k \geq t} \gamma^{k-t} r_k$. For $\gamma = 1$ the expected gradient is the same. Given
+# $s_t$ and the steps before it, an earlier reward $r_k$ is a known number, and the score has mean zero (page 2). So
+# $E[r_k \nabla \log \pi(a_t \mid s_t)] = 0$ for $k < t$. The variance is not the same.
 
 # %%
 import gymnasium as gym
@@ -41,6 +42,7 @@ assert reward_to_go(rewards, dones, gamma=1.0)[:, 0].tolist() == [6, 5, 2, 30, 2
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)
 model = REINFORCE("MlpPolicy", env, baseline="none", gamma=1.0, seed=seed, device="cpu")
 rollout = sample(model, 400)
+# No episode had begun before the rollout, so the rewards before it are 0
 whole = total_return(rollout.returns.numpy(), rollout.timesteps.numpy(), model.gamma, np.zeros(env.num_envs))
 to_go, total = gradients_by_episode(rollout, rollout.returns, th.as_tensor(whole))
 variances = [gradient_statistics(gradients).variance for gradients in (total, to_go)]

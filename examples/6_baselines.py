@@ -62,8 +62,11 @@ figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.6), sharey=True, layout="const
 for ax, p in zip(axes, (0.5, 0.8), strict=True):
     with th.no_grad():
         model.policy.action_net.bias.copy_(th.tensor([1 - p, p]).log())
-    pq = p * (1 - p)
-    exact = [(4 * pq * (13 * p + 29 * (1 - p)) - 16 * pq**2) / 20, 16 * pq * (2 - 4 * pq) / 20, 16 * pq / 20]
+    # Of the worse and the better action: probability, mean reward and squared length of the score
+    chances, rewards, squares = np.array([1 - p, p]), np.array([3.0, 5.0]), 4 * np.array([p, 1 - p]) ** 2
+    constants = (0.0, chances @ rewards, (chances * squares) @ rewards / (chances @ squares))
+    # E[‖(R − b) S‖²] − ‖E[R S]‖² with Var R = 4; E[R S] has four components ±2 p (1 − p)
+    exact = [(chances @ (squares * ((rewards - b) ** 2 + 4)) - 16 * (p * (1 - p)) ** 2) / 20 for b in constants]
     rollout = sample(model, 10_000)
     measured = []
     for name, truth in zip(names, exact, strict=True):
@@ -86,10 +89,11 @@ plt.show()
 #
 # ## CartPole
 #
-# Here the return depends on the step: late in an episode little is left to earn. `compare_baselines` measures every
-# baseline on the same 200 episodes. Both variances of a ratio to "none" come from the same resamples (episodes drawn
-# again with replacement), so part of their fluctuation cancels. The ratio of "optimal" is therefore known more
-# precisely than its variance.
+# Here the return depends on the step: late in an episode little is left to earn. With the reward-to-go, $A = \sum_t
+# \nabla \log \pi(a_t \mid s_t) \, G_t$ takes the place of $R S$, and $b^* = E[\langle A, S \rangle] / E[\|S\|^2]$.
+# `compare_baselines` measures every baseline on the same 200 episodes. Both variances of a ratio to "none" come from
+# the same resamples (episodes drawn again with replacement), so part of their fluctuation cancels. The ratio of
+# "optimal" is therefore known more precisely than its variance.
 
 # %%
 env = make_vec_env("CartPole-v1", n_envs=8, seed=seed)

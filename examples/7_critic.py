@@ -2,10 +2,11 @@
 # # How far should a critic be trusted?
 #
 # A critic $V(s)$ can do more than serve as a baseline: it can stand in for the rewards that are still to come. With
-# $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$ the generalized advantage estimate is
-# $\sum_k (\gamma \lambda)^k \delta_{t+k}$ (Schulman et al., 2016). At $\lambda = 1$ it is $G_t - V(s_t)$. A wrong $V$
-# then changes the variance, but not the expectation, where no time limit cuts the episode and $V$ is 0 after the last
-# state. At $\lambda = 0$ only $\delta_t$ is left: little noise, and all errors of $V$.
+# $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$ the generalized advantage estimate is $\sum_k (\gamma \lambda)^k
+# \delta_{t+k}$ (Schulman et al., 2016). It equals $G_t^\lambda - V(s_t)$, which the code computes from the λ-return
+# $G_t^\lambda = r_t + \gamma [(1 - \lambda) V(s_{t+1}) + \lambda G_{t+1}^\lambda]$. At $\lambda = 1$ it is $G_t -
+# V(s_t)$. A wrong $V$ then changes the variance, but not the expectation, where no time limit cuts the episode and $V$
+# is 0 after the last state. At $\lambda = 0$ only $\delta_t$ is left: little noise, and all errors of $V$.
 
 # %%
 import matplotlib.pyplot as plt
@@ -39,7 +40,7 @@ def norm_of_mean(gradients):
 
 
 def bias_and_noise():
-    """The bias of each λ, as a share of the gradient, and the standard deviation of a gradient of 16 episodes."""
+    """The bias of each λ against λ = 1, and the standard deviation of 16 episodes, as shares of the gradient."""
     rollout = sample(model, 300)
     rewards, dones, next_values = (part.numpy() for part in (rollout.rewards, rollout.dones, rollout.next_values))
     returns = [th.as_tensor(lambda_return(rewards, dones, next_values, model.gamma, lam)) for lam in lambdas]

@@ -55,7 +55,7 @@ class FiniteDifference(BasePolicyGradient):
     """
     Search in the space of a policy's parameters, by a gradient that is estimated from returns alone.
 
-    One optimizer step per update, along ĝ ≈ ∇θ U(θ), where U(θ) = E[Σ_t r_t] is the expected return of an episode:
+    One optimizer step per update, from ĝ ≈ ∇θ U(θ), where U(θ) = E[Σ_t r_t] is the expected return of an episode:
 
         ``central:     2Δ ĝ ≈ U(θ+Δ) − U(θ−Δ)``
         ``forward:      Δ ĝ ≈ U(θ+Δ) − U(θ)``
@@ -90,8 +90,8 @@ class FiniteDifference(BasePolicyGradient):
         are counted and not used
     :param n_top: With ``"central"``, use only the ``n_top`` perturbations with the best candidates, as ARS does
     :param standardize_utilities: Divide the gradient by the standard deviation of all utilities (ARS: of those that
-        ``n_top`` leaves) and multiply it by ``delta_std``: the step then depends neither on the scale of the rewards
-        nor on ``delta_std``
+        ``n_top`` leaves) and multiply it by ``delta_std``: the step then does not depend on the scale of the rewards,
+        and hardly on ``delta_std`` where perturbations, not starts or noise, cause most of that deviation
     :param deterministic: Whether candidates take their most likely actions, or sample
     :param max_grad_norm: Bound on the norm of a step's gradient; None or inf for no bound
     :param max_episode_steps: The length beyond which an episode raises an error

@@ -69,7 +69,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     """
     REINFORCE, the likelihood-ratio policy gradient, with a choice of returns, baselines and rollouts.
 
-    One step per rollout, along
+    One step per rollout, by an optimizer (Adam by default) or along the natural gradient, from the estimate
 
         ``ĝ = Σ_episodes Σ_t  m_t · γ^t · ∇θ log πθ(a_t|s_t) · (G_t − b_t)  /  denominator``
 
@@ -80,7 +80,8 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     ``normalize_by="episodes"``, ``discount_scores=True``, ``ent_coef=0``, the baseline ``"none"``, ``"leave_one_out"``
     or ``"optimal"``, and without ``normalize_advantage`` and clipping. gSDE is an exception: its steps share noise, and
     Stable-Baselines3 cuts the gradient where the noise depends on the features. So are dropout, batch normalization and
-    noisy layers, with which the policy that is trained is not the one that acts, as in A2C.
+    noisy layers, with which the policy that is trained is not the one that acts, as in A2C, and a ``VecNormalize`` that
+    is still learning. Episodes must not influence each other.
 
     Unfinished episodes: with ``baseline="value"`` the critic's V is added at a time limit and where ``n_steps`` cuts an
     episode. Without a critic a time limit counts as the end of the episode, and an episode that ``n_steps`` cuts is
@@ -101,7 +102,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     :param gamma: Discount factor
     :param gae_lambda: λ of the λ-return G_t: 1 is the Monte Carlo return, 0 the one-step return r_t + γ V(s_{t+1}).
         Below 1 only with ``baseline="value"`` and ``reward_to_go=True``
-    :param ent_coef: Weight of the entropy in the objective, it can be a schedule
+    :param ent_coef: Weight of the gradient of the entropy at the visited states, it can be a schedule
     :param vf_coef: Weight of the critic's squared error in the optimizer's step, where a features extractor is shared
     :param max_grad_norm: Bound on the norm of a step's gradient, separately for actor and critic; None or inf for
         no bound
@@ -119,7 +120,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         discounted from the start of the episode and never takes the factor γ^t
     :param discount_scores: Use the factor γ^t of the exact gradient of E[G_0]; off by default, as in A2C and PPO
     :param normalize_by: The denominator for whole episodes: ``"steps"``, the number of used steps (the direction is
-        biased where lengths differ), or ``"episodes"``, the number of episodes (unbiased)
+        in general biased where lengths differ), or ``"episodes"``, the number of episodes (unbiased)
     :param n_critic_updates: Passes of the critic over each rollout
     :param batch_size: Minibatch size of the critic's passes
     :param critic_learning_rate: The critic's learning rate or schedule; None for ``learning_rate``

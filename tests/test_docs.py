@@ -166,6 +166,8 @@ def test_files_extras_and_make_targets_exist(name: str) -> None:
     text = TEXTS[name]
     paths = re.findall(r"[`\s(]((?:tests|examples|docs|sb3_reinforce|\.ci|\.github)/[\w./-]*\w)", text)
     missing = [path for path in paths if not (ROOT / path).exists() and not path.startswith("docs/_build")]
+    short = re.findall(r"(?<![\w/])((?:common|policies|envs|estimation|sampling|zoo)/[\w/]+\.(?:py|yml))", text)
+    missing += [path for path in short if not (ROOT / "sb3_reinforce" / path).exists()]
     assert not missing
     folder = next(path.parent for path in PAGES if path.name == name)
     assert all((folder / path).exists() for path in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text))
@@ -220,6 +222,8 @@ def test_the_table_of_ppos_arguments_has_their_defaults():
 def test_the_tables_of_pitfalls_and_private_names_are_complete():
     rows = re.findall(r"^\| `(\w+)` \| ", TEXTS["gradient_lab.md"], re.MULTILINE)
     assert rows == list(PITFALLS)
+    script = (ROOT / "examples" / "10_pitfalls.py").read_text(encoding="utf-8")
+    assert re.findall(r'^    "(\w+)": \(', script, re.MULTILINE) == list(PITFALLS)
     table = TEXTS["ARCHITECTURE.md"].partition("| name | where | why |")[2]
     names = [name for line in table.splitlines() if line.startswith("| `") for name in re.findall(r"`(\S+)`", line)]
     assert {name.strip("*") for name in names if name.strip("*").startswith("_")} == FOREIGN.keys()

@@ -43,7 +43,8 @@ def batches_of(model: REINFORCE, size: int, n_batches: int) -> Iterator[th.Tenso
 def draw(variances: np.ndarray, timesteps: int, n_batches: int, path: Path) -> None:
     """The picture of variances of shape (n_groups, n_sizes, n_baselines)."""
     matplotlib.use("agg")
-    labels = [f"{name} (biased)" if name in ("mean", "time_mean") else name for name in BASELINES]
+    unbiased = ("none", "leave_one_out", "value", "optimal")
+    labels = [name if name in unbiased else f"{name} (biased)" for name in BASELINES]
     ax = plot_variances({label: variances[:, :, index] for index, label in enumerate(labels)}, SIZES)
     measured = f"mean of {len(variances)} groups of {n_batches} gradients"
     ax.set_title(f"CartPole-v1, one policy after {timesteps:,} steps\n{measured}", fontsize="medium")

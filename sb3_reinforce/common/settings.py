@@ -37,6 +37,7 @@ MAX_SEED = 2**32 - 1
 MAX_TEMPERATURE = 1e6
 # Noise this strong drowns a mean or a parameter
 MAX_STD = 1e6
+COMPARE_EPISODES = ("time_mean", "leave_one_out", "optimal")
 USE_RECURRENT = "a memory needs sb3_reinforce.recurrent.RecurrentREINFORCE; VecFrameStack may be enough instead"
 USE_MASKED_POLICY = "use MaskedPolicy and wrap the environment in ActionMaskObservation"
 RECURRENT = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy", "RecurrentActorCriticPolicy")
@@ -180,9 +181,8 @@ def check_reinforce(model: Any) -> None:
     if model.n_steps is not None and model.n_episodes is not None:
         given = f"n_steps={model.n_steps!r} and n_episodes={model.n_episodes!r}"
         raise ValueError(f"{given} are both set: a rollout has a length in steps or in episodes. Set one to None")
-    compares_episodes = model.baseline in ("time_mean", "leave_one_out", "optimal")
     # For episodes that share their start, check_starts says what is allowed
-    if model.n_episodes == 1 and compares_episodes and not shares_starts:
+    if model.n_episodes == 1 and model.baseline in COMPARE_EPISODES and not shares_starts:
         reason = f"baseline={model.baseline!r}, which compares episodes"
         raise ValueError(f"n_episodes must be at least 2 with {reason}, got 1")
     if model.gae_lambda < 1 and not (model.has_critic and model.reward_to_go):
@@ -217,10 +217,10 @@ def check_starts(model: Any) -> None:
             f"{n_episodes}) and a number of environments that {m} divides, got n_steps={model.n_steps}, "
             f"n_episodes={model.n_episodes} and n_envs={model.n_envs}"
         )
-    if model.baseline in ("none", "mean", "value"):
+    if isinstance(model.baseline, str) and model.baseline not in COMPARE_EPISODES:
         raise ValueError(
-            f"episodes_per_start={m} needs a baseline that compares the episodes of a start ('time_mean', "
-            f"'leave_one_out', 'optimal' or a function), got baseline={model.baseline!r}"
+            f"episodes_per_start={m} needs a baseline that compares the episodes of a start "
+            f"({', '.join(map(repr, COMPARE_EPISODES))} or a function), got baseline={model.baseline!r}"
         )
 
 

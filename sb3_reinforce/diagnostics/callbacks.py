@@ -141,7 +141,7 @@ class GradientQualityCallback(Diagnosis):
 
 class PitfallCallback(Diagnosis):
     """
-    Warns once about each of nine known pitfalls of the policy gradient, and names the argument to change.
+    Warns once about each known pitfall of the policy gradient, and names the argument to change.
 
     Where several pitfalls have one cause, only the cause is reported. ``found`` has the warnings so far, by the name of
     the pitfall.

@@ -64,8 +64,8 @@ def leave_one_out(rollout: Rollout) -> th.Tensor:
     """
     ``b_t = mean of G_t over the other episodes that reach step t``, and 0 where there is none.
 
-    Unbiased: the returns of other episodes do not depend on this one's actions (Kool et al., 2019, "Buy 4 REINFORCE
-    samples").
+    Unbiased if episodes do not influence each other: the returns of the others do not depend on this one's actions
+    (Kool et al., 2019, "Buy 4 REINFORCE samples").
 
     :param rollout: The rollout
     :return: b_t, shape ``(n_steps, n_envs)``, float64

@@ -2,7 +2,7 @@
 Gradients of a utility from its values alone.
 
 An estimator is one function ``(U, θ, Δ) -> ĝ``: the utility, the center of shape ``(n,)`` and the perturbations of
-shape ``(k, n)``. All three here are one least-squares problem, ``design · ĝ ≈ differences``, with different designs.
+shape ``(k, n)``. Those named here are one least-squares problem, ``design · ĝ ≈ differences``, with different designs.
 Everything is float64, since differences of nearly equal numbers are taken.
 
 A utility maps candidates of shape ``(k, n)`` to ``(k,)``; it compares all of them with each other, so with common

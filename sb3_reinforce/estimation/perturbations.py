@@ -100,7 +100,7 @@ def sample_deltas(perturbation: Perturbation, k: int, n: int, delta_std: float, 
     deltas = check_tensor("perturbation", perturbation(k, n, generator), (k, n))
     # With few signs in all, the rows are often equal, and the regression has no direction. Drawing again keeps the mean
     # and covariance of each δ, but the rows of one draw are then no longer independent
-    while k > 1 and perturbation in (rademacher, sphere) and (deltas == deltas[0]).all():
+    while k > 1 and perturbation in PERTURBATIONS.values() and (deltas == deltas[0]).all():
         deltas = perturbation(k, n, generator)
     return delta_std * deltas
 

@@ -132,7 +132,8 @@ def sampled_divergence(policy: ActorCriticPolicy, obs: Any, actions: th.Tensor, 
     """
     The mean of KL(π_old ‖ π), estimated by ``r − 1 − log r`` with ``r = π(a|s) / π_old(a|s)`` for actions of π_old.
 
-    Schulman (2020), "Approximating KL Divergence", k₃: unbiased and never negative. NaN if π's outputs are.
+    Schulman (2020), "Approximating KL Divergence", k₃: never negative, and unbiased for a π that was not trained on
+    these actions. NaN if π's outputs are.
     """
     try:
         log_ratio = acting_log_prob(policy, obs, actions) - old
