@@ -62,8 +62,8 @@ assert means[0.0] < -0.7 and means[1.5] > 1
 # $E[\text{return}] + c H$. Here three arms pay 1, 1.1 and 1.2 on average, with noise of standard deviation 1. At
 # temperature 1 the policy starts with a probability of 0.999 for the worst arm, and hardly sees the others. Without a
 # schedule the policy mostly keeps choosing the worst arm. With a schedule it tries the other arms first and decides
-# later: at temperature 5 the worst arm has a probability of only 0.71. Its probabilities are printed at the last
-# temperature, 0.1, which sharpens them; those of the others at 1.
+# later: at temperature 5 the worst arm has a probability of only 0.71. The runs with this schedule print
+# π(best arm) at its last temperature, 0.1, which sharpens the policy; the other runs print it at temperature 1.
 
 
 # %%

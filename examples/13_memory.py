@@ -68,8 +68,8 @@ class TMaze(gym.Env):
 # %% [markdown]
 # The memory is an Elman network with orthogonal weights, which keeps a signal for long. The gates of an LSTM start half
 # open, and the cue fades; `--forget-bias 2` keeps it longer. The policy must still explore when it discovers that the
-# cue matters, so the entropy bonus falls to 0 only at the end. The names are SB3-Contrib's: in `"MlpLstmPolicy"`,
-# `memory` chooses the cell and `lstm_hidden_size` its size.
+# cue matters, so the entropy bonus falls to 0 only at the end. `"MlpLstmPolicy"` and
+# `lstm_hidden_size` are SB3-Contrib's names, whatever the cell is; `memory` chooses the cell.
 
 # %%
 settings = {

@@ -63,8 +63,8 @@ if model.num_timesteps < 200_000:
 print(f"The best evaluation of 20 episodes scored {until_solved.best_mean_reward:.1f} on average.")
 
 # %% [markdown]
-# One evaluation that was good enough to stop may have been lucky. So 100 more episodes are played. After ± stands the
-# standard deviation of one return; the standard error of the mean is a tenth of it.
+# One evaluation that was good enough to stop may have been lucky. So 100 more episodes are played. The number after ±
+# is the standard deviation of one return; the standard error of the mean is a tenth of it.
 
 # %%
 mean, std = evaluate_policy(model, make_vec_env("CartPole-v1", n_envs=50, seed=2000 + seed), n_eval_episodes=100)

@@ -131,9 +131,10 @@ assert (probabilities @ softmax_scores).abs().max() < 1e-6 and gaussian_scores.m
 # ## When all returns are positive
 #
 # Three actions with returns 8, 10 and 12, each taken once. (Only the returns of the sampled rollout are replaced, since
-# these baselines read nothing else.) Without a baseline each episode pushes its action up, only by different amounts.
-# With the mean of the batch the action with the average return is left alone. The mean contains the return that it is
-# subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does not.
+# these baselines do not read the actions.) Without a baseline each episode pushes its action up, only by different
+# amounts. With the mean of the batch the action with the average return is left alone. The mean contains the return
+# that it is subtracted from, which scales the expected gradient by $(N - 1) / N$; the mean of the *other* episodes does
+# not.
 
 # %%
 rollout = replace(sample(make_model(8.0, 10.0, 12.0), 3), returns=th.tensor([[8.0], [10.0], [12.0]], dtype=th.float64))
@@ -185,7 +186,9 @@ optimizer = th.optim.Adam(policy.parameters(), lr=0.1)
 means = []
 for _ in range(10):
     episodes = [play(env, policy) for _ in range(16)]
-    loss = -sum((log_probs * rewards.flip(0).cumsum(0).flip(0)).sum() for log_probs, rewards in episodes) / 16
+    # The reward-to-go is a cumulative sum from the end
+    terms = [(log_probs * rewards.flip(0).cumsum(0).flip(0)).sum() for log_probs, rewards in episodes]
+    loss = -th.stack(terms).sum() / 16
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()

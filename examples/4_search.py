@@ -3,9 +3,9 @@
 #
 # `FiniteDifference` perturbs the parameters of a policy, looks at the returns of each perturbed policy and fits a plane
 # to them. The slope of the plane estimates the gradient of the utility, smoothed over the perturbations. The slope is
-# divided by the standard deviation of the returns and multiplied by that of the perturbations, so that the scale of the
-# rewards does not matter, and Adam takes the step. The search needs no $\nabla \log \pi$, so the policy may be
-# deterministic.
+# divided by the standard deviation of the returns and multiplied by the standard deviation of the perturbations, so
+# that the scale of the rewards does not matter, and Adam takes the step. The search needs no $\nabla \log \pi$, so the
+# policy may be deterministic.
 
 # %%
 import torch as th

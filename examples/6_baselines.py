@@ -65,7 +65,7 @@ for ax, p in zip(axes, (0.5, 0.8), strict=True):
     # Of the worse and the better action: probability, mean reward and squared length of the score
     chances, rewards, squares = np.array([1 - p, p]), np.array([3.0, 5.0]), 4 * np.array([p, 1 - p]) ** 2
     constants = (0.0, chances @ rewards, (chances * squares) @ rewards / (chances @ squares))
-    # E[‖(R − b) S‖²] − ‖E[R S]‖² with Var R = 4; E[R S] has four components ±2 p (1 − p)
+    # E[‖(R − b) S‖²] − ‖E[R S]‖² with Var(R | a) = 4; E[R S] has four components ±2 p (1 − p)
     exact = [(chances @ (squares * ((rewards - b) ** 2 + 4)) - 16 * (p * (1 - p)) ** 2) / 20 for b in constants]
     rollout = sample(model, 10_000)
     measured = []

@@ -40,7 +40,7 @@ def norm_of_mean(gradients):
 
 
 def bias_and_noise():
-    """The bias of each λ against λ = 1, and the standard deviation of 16 episodes, as shares of the gradient."""
+    """As shares of the gradient: each λ's bias against λ = 1, and the standard deviation of the mean of 16 episodes."""
     rollout = sample(model, 300)
     rewards, dones, next_values = (part.numpy() for part in (rollout.rewards, rollout.dones, rollout.next_values))
     returns = [th.as_tensor(lambda_return(rewards, dones, next_values, model.gamma, lam)) for lam in lambdas]

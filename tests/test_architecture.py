@@ -186,7 +186,7 @@ def test_diagnostics_read_only_what_is_public() -> None:
 def test_files_are_short() -> None:
     lengths = {path: len((ROOT / path).read_text(encoding="utf-8").splitlines()) for path in TREES.keys() - LONGER}
     too_long = {path: length for path, length in lengths.items() if length >= MAX_LINES}
-    assert not too_long, f"files have less than {MAX_LINES} lines: split these, or name them in LONGER with the reason"
+    assert not too_long, f"files have fewer than {MAX_LINES} lines: split these, or name them in LONGER with the reason"
 
 
 def parameters_of(thing: object) -> list[str]:

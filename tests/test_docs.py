@@ -166,7 +166,8 @@ def test_files_extras_and_make_targets_exist(name: str) -> None:
     text = TEXTS[name]
     paths = re.findall(r"[`\s(]((?:tests|examples|docs|sb3_reinforce|\.ci|\.github)/[\w./-]*\w)", text)
     missing = [path for path in paths if not (ROOT / path).exists() and not path.startswith("docs/_build")]
-    short = re.findall(r"(?<![\w/])((?:common|policies|envs|estimation|sampling|zoo)/[\w/]+\.(?:py|yml))", text)
+    folders = "common|policies|envs|estimation|sampling|diagnostics|zoo"
+    short = re.findall(rf"(?<![\w/-])((?:{folders})/[\w/]+\.(?:py|yml))", text)
     missing += [path for path in short if not (ROOT / "sb3_reinforce" / path).exists()]
     assert not missing
     folder = next(path.parent for path in PAGES if path.name == name)
