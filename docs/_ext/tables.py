@@ -32,7 +32,7 @@ def final(*names: str) -> pd.DataFrame:
 
 def compared() -> pd.DataFrame:
     """The final evaluations of REINFORCE and its peers."""
-    return final("comparison", "comparison_long", "comparison_others", "comparison_short")
+    return final("comparison", "comparison_short", "comparison_long", "comparison_others")
 
 
 def beside_peers(task: str, budget: int, runs: pd.DataFrame) -> list[str]:
