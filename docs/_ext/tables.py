@@ -1,5 +1,6 @@
 """The tables of results, computed from the CSVs in ``examples/benchmarks/results``."""
 
+import numpy as np
 import pandas as pd
 from cells import LABELS, NONE, by_task, counted, markdown, number, read, short, spread
 
@@ -9,6 +10,8 @@ README_TASKS = {
     "LunarLander-v3": 1_000_000, "HalfCheetah-v5": 1_000_000, "Walker2d-v5": 1_000_000,
 }  # fmt: skip
 PEERS = ("a2c", "ppo", "trpo")
+# Of the last one's tasks not all runs were made in one go
+COMPARISONS = ("comparison", "comparison_short", "comparison_long", "comparison_others")
 
 
 def published(task: str, *algorithms: str) -> str:
@@ -32,7 +35,7 @@ def final(*names: str) -> pd.DataFrame:
 
 def compared() -> pd.DataFrame:
     """The final evaluations of REINFORCE and its peers."""
-    return final("comparison", "comparison_short", "comparison_long", "comparison_others")
+    return final(*COMPARISONS)
 
 
 def beside_peers(task: str, budget: int, runs: pd.DataFrame) -> list[str]:
@@ -68,6 +71,42 @@ def seconds() -> str:
         medians = runs.groupby("algorithm")["cpu_seconds"].median()
         lines.append([task, *(number(medians[name], 0) for name in ("reinforce", *PEERS))])
     return markdown(["task", "REINFORCE", "A2C", "PPO", "TRPO"], lines)
+
+
+def curve(runs: pd.DataFrame, column: str, points: np.ndarray) -> np.ndarray:
+    """The interquartile mean of the seeds' returns at values of a column."""
+    returns = np.sort([np.interp(points, run[column], run["return"]) for _, run in runs.groupby("seed")], axis=0)
+    cut = len(returns) // 4
+    return returns[cut : len(returns) - cut].mean(axis=0)
+
+
+def ahead(ours: pd.DataFrame, theirs: pd.DataFrame, column: str) -> str:
+    """The share of a column's values where their curve is above ours, with the largest difference in brackets."""
+    ends = [runs.loc[runs["evaluation"] == "final", column].median() for runs in (ours, theirs)]
+    points = np.linspace(0, min(ends), 1001)
+    lead = curve(theirs, column, points) - curve(ours, column, points)
+    share = f"{100 * (lead > 0).mean():.0f}"
+    return NONE if share == "0" else f"{share} % ({number(lead.max())})"
+
+
+def leads() -> str:
+    """How long, and by how much, other algorithms are ahead of REINFORCE, by steps and by seconds."""
+    lines = []
+    for name in COMPARISONS:
+        for task, budget, rows in by_task(read(name)):
+            # Of some runs only the final evaluation was kept
+            runs = {each: mine for each, mine in rows.groupby("algorithm") if mine["seed"].value_counts().min() > 1}
+            if not runs.keys() >= {"reinforce", *PEERS}:
+                continue
+            common = set.intersection(*(set(mine["seed"]) for mine in runs.values()))
+            timed = {each: mine[mine["seed"].isin(common)] for each, mine in runs.items()}
+            by_steps = [ahead(runs["reinforce"], runs[peer], "steps") for peer in PEERS]
+            by_seconds = [""] * 3
+            if name != COMPARISONS[-1]:
+                by_seconds = [ahead(timed["reinforce"], timed[peer], "cpu_seconds") for peer in PEERS]
+            lines.append([f"{task} ({short(budget)})", *by_steps, *by_seconds])
+    clocks = [f"{LABELS[peer]}, {clock}" for clock in ("steps", "seconds") for peer in PEERS]
+    return markdown(["task (steps)", *clocks], lines)
 
 
 def readme() -> str:
