@@ -4,8 +4,8 @@ Does FiniteDifference end as high as SB3-Contrib's ARS with the RL Zoo's setting
     python examples/benchmarks/search_vs_ars.py --env Pendulum-v1 --seeds 20 21 22 23 24 --output search.csv
 
 FiniteDifference takes the settings of ``sb3_reinforce.zoo``. Each run adds a line to the CSV, with the mean return of
-100 episodes of the last policy within the budget. A VecNormalize has the statistics of the end of training, a little
-later.
+100 episodes of the policy before the last update, which may end beyond the budget. A VecNormalize has the statistics of
+the end of training, one update later.
 """
 
 import argparse
@@ -24,17 +24,12 @@ from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalizati
 NAMES = {"FiniteDifference": "finite_difference", "ARS": "ars"}
 
 
-class LastWithin(BaseCallback):
-    """Remembers the last policy that was found within the budget; an update may begin within it and end beyond."""
-
-    def __init__(self, timesteps: int):
-        super().__init__()
-        self.timesteps = timesteps
+class BeforeLastUpdate(BaseCallback):
+    """Remembers the policy from which the last update started."""
 
     def _on_rollout_start(self) -> None:
-        if self.num_timesteps <= self.timesteps:
-            self.policy = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
-            self.steps = self.num_timesteps
+        self.policy = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
+        self.steps = self.num_timesteps
 
     def _on_step(self) -> bool:
         return True
@@ -69,7 +64,7 @@ def main() -> None:
     for seed in arguments.seeds:
         for name in arguments.algo:
             model, _, _ = make(Run(arguments.env, NAMES[name], seed, timesteps))
-            callback = LastWithin(timesteps)
+            callback = BeforeLastUpdate()
             model.learn(timesteps, callback, log_interval=None)
             after = mean_return(model, arguments.env)
             model.policy.load_state_dict(callback.policy)
