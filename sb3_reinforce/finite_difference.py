@@ -236,16 +236,21 @@ class FiniteDifference(BasePolicyGradient):
         :param progress_bar: Display a progress bar using tqdm and rich
         :return: The trained model
         :raises TypeError: If an argument is of the wrong type
-        :raises ValueError: If an argument is out of its range, the model has no environment, PyTorch's default device
-            is not the CPU, processes under torchrun have different arguments, nothing is left to search, a user's
-            estimator or perturbation returns another shape, a perturbation, reward, observation or action is not
-            finite, all perturbations are zero (for ``"regression"``: equal), an episode does not end, or with common
-            random numbers the environments cannot be seeded one by one; and as in ``train``. The policy is the last
-            good one
+        :raises ValueError: If an argument is out of its range, the model has no environment, PyTorch is in inference
+            mode, its default device is not the CPU, processes under torchrun have different arguments, nothing is left
+            to search, a user's estimator or perturbation returns another shape, a perturbation, reward, observation or
+            action is not finite, all perturbations are zero (for ``"regression"``: equal), an episode does not end, or
+            with common random numbers the environments cannot be seeded one by one; and as in ``train``. The policy is
+            the last good one
         :raises ConnectionError: If a worker of a ``SubprocVecEnv`` dies
         :raises RuntimeError: If another process under torchrun has stopped or died; the policy is the last good one
         """
         check_learn(self.env, total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if th.is_inference_mode_enabled():
+            raise ValueError(
+                "learn cannot run in th.inference_mode, whose tensors the optimizer cannot change later: leave the "
+                "block, or use th.no_grad"
+            )
         # Before the counters are reset
         self._check_arguments()
         tb_log_name = type(self).__name__ if tb_log_name is None else tb_log_name
@@ -280,14 +285,14 @@ class FiniteDifference(BasePolicyGradient):
         It advances the counts of steps and episodes and the generator of the perturbations, and updates the statistics
         of VecNormalize.
 
-        ``learn`` calls it. If you call it yourself, seed the environments again afterwards (``env.seed``): with common
-        random numbers all have the seed of the last candidates.
+        ``learn`` calls it. If you call it yourself with common random numbers, all environments have the seed of the
+        last candidates afterwards. ``learn`` gives them other seeds; before other uses seed them again (``env.seed``).
 
         :param callback: Called at each step and at both ends of the rollout; call its ``init_callback`` first
         :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them
-        :raises ValueError: As ``learn``, or if ``learn`` was never called
+        :raises ValueError: As ``learn``, or if ``learn`` was never called, or not since the model was loaded
         """
-        if self.ep_info_buffer is None:
+        if self.ep_info_buffer is None or not hasattr(self, "logger"):
             raise ValueError("estimate_gradient needs the counters and the log that learn creates: call learn(0) first")
         callback.on_rollout_start()
         # The user or a callback may have changed arguments

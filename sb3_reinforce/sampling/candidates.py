@@ -43,8 +43,7 @@ class EpisodeTracker:
     def __init__(self, queue: list[Pair], n_envs: int, max_episode_steps: int):
         self.pairs = queue[:n_envs]
         self.waiting = queue[n_envs:]
-        self.n_active = len(self.pairs)
-        self.active = np.arange(n_envs) < self.n_active
+        self.active = np.arange(n_envs) < len(self.pairs)
         self.totals = np.zeros(n_envs)
         self.clock = 0
         self.started_at = np.zeros(n_envs, dtype=int)
@@ -73,7 +72,6 @@ class EpisodeTracker:
             else:
                 # Its last candidate keeps acting: these steps are only counted
                 self.active[env] = False
-                self.n_active -= 1
         self.first_step = int(self.started_at.min())
         return restarted
 
@@ -120,7 +118,7 @@ def evaluate_candidates(
         if starts is not None:
             compare_with_earlier(met, starts, obs)
         started = list(range(len(tracker.pairs)))
-        while tracker.n_active:
+        while tracker.active.any():
             if started:
                 actor.assign(started, thetas[[tracker.pairs[i][0] for i in started]])
                 started = []

@@ -18,10 +18,15 @@ from sb3_reinforce.estimation.perturbations import default_delta_std
 from sb3_reinforce.sampling.candidates import seeds_of
 
 
-def test_an_estimate_before_learn_is_refused():
+def test_an_estimate_before_learn_is_refused(tmp_path):
+    """A loaded model has no log."""
     model = make(Line())
     with pytest.raises(ValueError, match=r"call learn\(0\) first"):
         model.estimate_gradient(Record(lambda model: None))
+    model.learn(0).save(tmp_path / "model")
+    loaded = FiniteDifference.load(tmp_path / "model", env=Line())
+    with pytest.raises(ValueError, match=r"call learn\(0\) first"):
+        loaded.estimate_gradient(Record(lambda model: None))
 
 
 def test_the_gradient_is_the_estimator_applied_to_the_utility():

@@ -300,3 +300,14 @@ def test_without_gradients_nothing_is_learned_in_silence(kind, block):
     with block(), th.set_grad_enabled(block is th.inference_mode), pytest.raises(ValueError, match="gradients"):
         model.learn(16)
     assert model.num_timesteps == 0
+
+
+def test_no_search_in_inference_mode():
+    """Adam's moments could not be changed in a later call."""
+    model = make("search")
+    with th.inference_mode(), pytest.raises(ValueError, match="inference_mode"):
+        model.learn(16)
+    assert model.num_timesteps == 0
+    with th.no_grad():
+        model.learn(16)
+    model.learn(16)
