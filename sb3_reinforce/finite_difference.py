@@ -293,7 +293,10 @@ class FiniteDifference(BasePolicyGradient):
         :raises ValueError: As ``learn``, or if ``learn`` was never called, or not since the model was loaded
         """
         if self.ep_info_buffer is None or not hasattr(self, "logger"):
-            raise ValueError("estimate_gradient needs the counters and the log that learn creates: call learn(0) first")
+            raise ValueError(
+                "estimate_gradient needs the counters and the log that learn creates: call learn(0) first, for a "
+                "loaded model with reset_num_timesteps=False"
+            )
         callback.on_rollout_start()
         # The user or a callback may have changed arguments
         searched = self._check_arguments()

@@ -10,7 +10,6 @@ README_TASKS = {
     "LunarLander-v3": 1_000_000, "HalfCheetah-v5": 1_000_000, "Walker2d-v5": 1_000_000,
 }  # fmt: skip
 PEERS = ("a2c", "ppo", "trpo")
-# Of the last one's tasks not all runs were made in one go
 COMPARISONS = ("comparison", "comparison_short", "comparison_long", "comparison_others")
 
 
@@ -99,14 +98,13 @@ def leads() -> str:
             if not runs.keys() >= {"reinforce", *PEERS}:
                 continue
             common = set.intersection(*(set(mine["seed"]) for mine in runs.values()))
-            timed = {each: mine[mine["seed"].isin(common)] for each, mine in runs.items()}
-            by_steps = [ahead(runs["reinforce"], runs[peer], "steps") for peer in PEERS]
-            by_seconds = [""] * 3
-            if name != COMPARISONS[-1]:
-                by_seconds = [ahead(timed["reinforce"], timed[peer], "cpu_seconds") for peer in PEERS]
-            lines.append([f"{task} ({short(budget)})", *by_steps, *by_seconds])
-    clocks = [f"{LABELS[peer]}, {clock}" for clock in ("steps", "seconds") for peer in PEERS]
-    return markdown(["task (steps)", *clocks], lines)
+            runs = {each: mine[mine["seed"].isin(common)] for each, mine in runs.items()}
+            # Seconds of runs that were not made in one go cannot be compared
+            clocks = ["steps"] if name == "comparison_others" else ["steps", "cpu_seconds"]
+            cells = [ahead(runs["reinforce"], runs[peer], clock) for clock in clocks for peer in PEERS]
+            lines.append([f"{task} ({short(budget)})", *cells, *[""] * (6 - len(cells))])
+    columns = [f"{LABELS[peer]}, {clock}" for clock in ("steps", "seconds") for peer in PEERS]
+    return markdown(["task (steps)", *columns], lines)
 
 
 def readme() -> str:
