@@ -290,7 +290,8 @@ class FiniteDifference(BasePolicyGradient):
 
         :param callback: Called at each step and at both ends of the rollout; call its ``init_callback`` first
         :return: ĝ, and the evaluations that it was estimated from; None if the callback stopped them
-        :raises ValueError: As ``learn``, or if ``learn`` was never called, or not since the model was loaded
+        :raises ValueError: As ``learn``, or if ``learn`` was never called, or not since the model was loaded; then call
+            ``learn(0)``, for a loaded model with ``reset_num_timesteps=False``
         """
         if self.ep_info_buffer is None or not hasattr(self, "logger"):
             raise ValueError(

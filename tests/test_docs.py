@@ -87,7 +87,7 @@ RUN = {
 }
 # Benchmarks take seconds even so; whether their options exist is checked below each time
 SLOW = [name for name, found in RUN.items() if any("examples/benchmarks" in command for command in found)]
-WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo) \w|\.py\b.* --")
+WITH_OPTIONS = re.compile(r"(sb3_reinforce\.zoo|sb3-reinforce-zoo)[ .]\w|\.py\b.* --")
 
 
 @pytest.mark.parametrize("name", [path.name for path in PAGES[1:] if blocks(TEXTS[path.name], "python")])
@@ -147,6 +147,9 @@ def test_every_reason_not_to_run_a_command_is_needed() -> None:
 
 def options_of(command: str) -> str:
     """The source that defines the options of a command that starts Python."""
+    module = re.search(r"-m sb3_reinforce\.zoo\.(\w+)", command)
+    if module:
+        return (ROOT / "sb3_reinforce" / "zoo" / f"{module[1]}.py").read_text(encoding="utf-8")
     zoo = re.search(r"(?:-m sb3_reinforce\.zoo|sb3-reinforce-zoo) (\w+)", command)
     if zoo:
         return (Path(rl_zoo3.__file__).parent / f"{zoo[1]}.py").read_text(encoding="utf-8")

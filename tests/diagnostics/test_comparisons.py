@@ -8,7 +8,6 @@ import pandas
 import pytest
 import torch as th
 from environments import Corridor, NumericEnds, Tree
-from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_reinforce import REINFORCE
@@ -23,8 +22,6 @@ from sb3_reinforce.diagnostics.baseline_comparison import componentwise_residual
 from sb3_reinforce.diagnostics.tables import Estimate
 from sb3_reinforce.estimation.baselines import BASELINES
 from sb3_reinforce.estimation.scores import gradient_blocks
-
-BOX = spaces.Box(-1, 1, (1,))
 
 
 class GaussianBandit(Corridor):
@@ -150,7 +147,7 @@ def test_a_progress_bar_counts_the_episodes(capsys):
         assert f"| {shown} [" in capsys.readouterr().err
 
 
-def test_bias_is_told_where_theory_knows_it():
+def test_bias_is_known_where_theory_knows_it():
     table = compare_baselines(REINFORCE("MlpPolicy", Tree(), device="cpu"), 10)
     assert [table[name].bias for name in ("none", "leave_one_out", "value", "optimal")] == [0, 0, 0, 0]
     assert table["time_mean"].bias == 1 / 10

@@ -87,7 +87,8 @@ def test_a_model_is_as_it_was_and_goes_on(measure):
         logged = dict(model.logger.name_to_value)
         names = ("n_steps", "n_episodes", "episodes_per_start", "baseline", "gamma", "gae_lambda", "max_grad_norm")
         kept = [getattr(model, name) for name in (*names, "num_timesteps", "logger", "rollout")]
-        return kept, model.policy.optimizer, counts, logged
+        optimizers = plain([each.state_dict() for each in (model.policy.optimizer, model.critic_optimizer)])
+        return kept, model.policy.optimizer, optimizers, counts, logged
 
     before, parameters = state(), {name: value.clone() for name, value in model.policy.state_dict().items()}
     measure(model)
