@@ -376,15 +376,16 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
 
     def _start_episodes(self, env: VecEnv, are_whole: bool) -> None:
         """Reset the environments where the next rollout does not continue their episodes."""
-        if self.episodes_per_start > 1:
-            self._last_obs = None
-            self._last_obs = start_groups(env, self.episodes_per_start)
+        shares_starts = self.episodes_per_start > 1
         # A measurement that failed in a callback leaves no observation
-        elif self._last_obs is None or (are_whole and not np.all(self._last_episode_starts)):
-            self._last_obs = start_episodes(env, None)
-        else:
+        is_needed = self._last_obs is None or (are_whole and not np.all(self._last_episode_starts))
+        if not (is_needed or shares_starts):
             return
+        # Set last: if an error or Ctrl-C comes before, the environments are reset again
+        self._last_obs = None
+        obs = start_groups(env, self.episodes_per_start) if shares_starts else start_episodes(env, None)
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        self._last_obs = obs
 
     def _complete(self, buffer: RolloutBuffer, columns: Columns, baseline: Baseline, is_fixed: bool) -> Rollout:
         """The rollout with the weights of its steps, which the buffer gets too."""

@@ -85,8 +85,8 @@ def check_observation(space: spaces.Space[Any], obs: Any, env: object) -> None:
     except ValueError as error:
         raise BadData(f"The observation of environment {env} must be an array, got {obs!r}: {error}") from error
     fits = values.shape == space.shape and values.dtype.kind in "biuf"
-    if fits and values.dtype.kind == "f" and np.dtype(space.dtype).kind != "f":
-        # Integers may stand for real numbers, and whole numbers for integers, but not fractions
+    if fits and values.dtype != space.dtype and np.dtype(space.dtype).kind != "f":
+        # Integers may stand for real numbers, and other numbers for integers that the dtype can hold
         with np.errstate(invalid="ignore"):
             fits = np.array_equal(values.astype(space.dtype), values)
     if not fits:
@@ -105,8 +105,8 @@ def checked_batch(space: spaces.Space[Any], obs: Any, n_envs: int) -> Any:
     rows = np.array(obs)
     if rows.shape[:1] != (n_envs,):
         raise BadData(f"There must be observations of {n_envs} environments, got shape {rows.shape}")
-    # Rows of one array share their form, but some floats are whole numbers and some are not
-    share_form = isinstance(space, spaces.Box) and (rows.dtype.kind != "f" or np.dtype(space.dtype).kind == "f")
+    # Rows of one array share their form, but only some of their numbers may fit integers
+    share_form = isinstance(space, spaces.Box) and (rows.dtype == space.dtype or np.dtype(space.dtype).kind == "f")
     for i in range(1 if share_form else n_envs):
         check_observation(space, rows[i], i)
     return rows

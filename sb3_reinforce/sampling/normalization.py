@@ -10,7 +10,7 @@ from sb3_reinforce.common.moments import normalizers, observation_moments
 
 
 class ObservationStatistics:
-    """The statistics of observations that a frozen VecNormalize would have learned if it were not frozen."""
+    """The statistics of the observations of steps, from which a frozen VecNormalize would have learned."""
 
     def __init__(self, vec_normalize: VecNormalize):
         self.vec_normalize = vec_normalize

@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from callbacks import At, Record
 from environments import Corridor, Faulty
+from gymnasium.wrappers import TimeLimit
 from models import KINDS, all_kinds, make, plain
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -73,23 +74,43 @@ def assert_counters_agree(model):
         assert rate == pytest.approx(model.lr_schedule(model._current_progress_remaining))
 
 
+def fail_in_reset(env, number):
+    reset, calls = env.reset, iter(range(1, 100))
+
+    def reset_and_fail(**kwargs):
+        returned = reset(**kwargs)
+        if next(calls) == number:
+            raise OSError("after the reset")
+        return returned
+
+    env.reset = reset_and_fail
+
+
 def test_after_a_reset_that_fails_episodes_start_again():
     """Not with the last observation of the run before."""
     env = Corridor((50,))
     model = make("steps", env).learn(20)
-    reset = env.reset
-
-    def reset_and_fail(**kwargs):
-        reset(**kwargs)
-        env.reset = reset
-        raise OSError("after the reset")
-
-    env.reset = reset_and_fail
+    fail_in_reset(env, 1)
     with pytest.raises(OSError, match="after the reset"):
         model.learn(20)
     rollouts = Record(lambda model: (model.rollout.observations[:, 0].argmax(-1), model.rollout.timesteps[:, 0]))
     model.learn(16, rollouts, reset_num_timesteps=False)
     assert plain(rollouts.records) == plain([[th.arange(i, i + 8)] * 2 for i in (0, 8)])
+
+
+def test_after_a_reset_between_rollouts_that_fails_episodes_start_again():
+    """Also where the user changes from whole episodes to steps."""
+    cut, whole = TimeLimit(Corridor((7,)), 3), Corridor((7,))
+    # After the reset at the start and the one after its first episode
+    fail_in_reset(whole, 3)
+    model = make("episodes", DummyVecEnv([lambda: cut, lambda: whole]), baseline="value")
+    with pytest.raises(OSError, match="after the reset"):
+        model.learn(100)
+    assert model.num_timesteps == 14
+    model.n_episodes, model.n_steps = None, 8
+    rollout = model.learn(8, reset_num_timesteps=False).rollout
+    assert th.equal(rollout.timesteps, rollout.observations.argmax(-1))
+    assert not rollout.timesteps[0].any()
 
 
 def test_timesteps_are_right_after_an_interruption_behind_a_rollout(monkeypatch):

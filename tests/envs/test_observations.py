@@ -54,7 +54,10 @@ INTEGERS = [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary
 @both
 @pytest.mark.parametrize(
     ("space", "value"),
-    [*product(INTEGERS, (-1, 3, 0.5)), *((spaces.Box(0, 255, (4,), np.uint8), value) for value in (-1.0, 0.5, np.nan))],
+    [
+        *product(INTEGERS, (-1, 3, 256, 0.5)),
+        *product([spaces.Box(0, 255, (4,), np.uint8)], (-1, 300, -1.0, 0.5, np.nan)),
+    ],
 )
 def test_numbers_that_the_space_does_not_have(space, value, kind):
     value = np.full(space.shape, value)[()]
