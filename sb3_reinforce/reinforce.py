@@ -317,9 +317,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         """
         self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
-        # The last rollout may have the columns of several processes
-        rollout_buffer.n_envs = env.num_envs
-        rollout_buffer.reset()
         n_steps = self.n_steps
         callback.on_rollout_start()
         # The user or a callback may have changed the environments, the policy and arguments
@@ -334,6 +331,10 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         if self.n_steps != n_steps:
             n_rollout_steps = self.n_steps
         self.start_round()
+        self.rollout = None
+        # The last rollout may have the columns of several processes
+        rollout_buffer.n_envs = env.num_envs
+        rollout_buffer.reset()
         self._start_episodes(env, n_rollout_steps is None)
         keep_fractions(rollout_buffer, self._last_obs, self.action_space)
         if n_rollout_steps is None:
@@ -342,7 +343,6 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         else:
             extent = Extent.fixed(n_rollout_steps, env.num_envs)
         baseline = check_function("baseline", self.baseline, BASELINES)
-        self.rollout = None
         is_collected = False
         self.is_collecting = True
         try:
@@ -579,7 +579,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         goes_on = self._last_obs is not None
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        if self.n_steps is None and self.num_timesteps > 0 and goes_on:
+        if self.n_steps is None and goes_on:
             # The environments may have been used since their last episodes ended
             self._last_obs = None
         # The first rollout has the temperature of the start, not the final one of an earlier run

@@ -190,6 +190,8 @@ class PitfallCallback(Diagnosis):
         leave_no_graph(policy, *first_step(rollout))
 
     def _on_training_start(self) -> None:
+        # An error or Ctrl-C may have come before its update
+        self.rollout = None
         self.path = 0.0
         self.n_moves = 0
 

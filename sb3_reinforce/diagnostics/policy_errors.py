@@ -29,7 +29,7 @@ N_OBSERVATIONS = 8
 def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
     """``‖x − y‖ / max(‖x‖, ‖y‖)``, and 0 where both are zero."""
     scale = max(float(x.norm()), float(y.norm()))
-    return float((x - y).norm()) / scale if scale > 0 else 0.0
+    return float((x - y).norm()) / scale if scale != 0 else 0.0
 
 
 @th.no_grad()

@@ -137,7 +137,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all copies; ``indices`` must be None or name all of them."""
-        if len(list(self._get_indices(indices))) != self.num_envs:
+        if {*self._get_indices(indices)} != {*range(self.num_envs)}:
             raise ValueError(f"indices must be None to set {attr_name!r} in a vector environment, got {indices}")
         if hasattr(self.env.unwrapped, "set_attr"):
             with self.finishes_calls:

@@ -141,5 +141,10 @@ def test_whole_episodes_go_on_from_one_reset(tmp_path):
         each.learn(1, reset_num_timesteps=False)
         first.append(each.rollout_buffer.observations[0].tolist())
         th.set_rng_state(random_state)
+    # Nor has a model without steps used the environments since
+    new = make("episodes", env, seed=0).learn(0)
     env.seed(7)
-    assert first == [env.reset().tolist()] * 2
+    new.learn(1, reset_num_timesteps=False)
+    first.append(new.rollout_buffer.observations[0].tolist())
+    env.seed(7)
+    assert first == [env.reset().tolist()] * 3

@@ -106,11 +106,20 @@ def test_after_a_reset_between_rollouts_that_fails_episodes_start_again():
     model = make("episodes", DummyVecEnv([lambda: cut, lambda: whole]), baseline="value")
     with pytest.raises(OSError, match="after the reset"):
         model.learn(100)
-    assert model.num_timesteps == 14
+    assert model.num_timesteps == 14 and model.rollout is None
     model.n_episodes, model.n_steps = None, 8
     rollout = model.learn(8, reset_num_timesteps=False).rollout
     assert th.equal(rollout.timesteps, rollout.observations.argmax(-1))
     assert not rollout.timesteps[0].any()
+
+
+def test_an_error_at_the_start_of_a_rollout_leaves_the_last_one_for_train():
+    model = make("steps", Corridor((50,)))
+    starts = Record(lambda model: model.num_timesteps < 8 or fail(model), at="rollout_start")
+    with pytest.raises(RuntimeError, match="callback"):
+        model.learn(16, starts)
+    np.testing.assert_array_equal(model.rollout_buffer.returns, model.rollout.returns.float())
+    assert model.rollout_buffer.returns.any()
 
 
 def test_timesteps_are_right_after_an_interruption_behind_a_rollout(monkeypatch):

@@ -1,5 +1,6 @@
 """The gradient check passes where the gradient is right."""
 
+import math
 from functools import partial
 
 import gymnasium as gym
@@ -239,3 +240,10 @@ def test_a_policy_that_has_learned_to_be_almost_deterministic_passes(seed):
     """Its log π is mostly rounding, and the more so with a larger last layer."""
     model = REINFORCE("CnnPolicy", make_vec_env(Sides, 8, seed=seed), device="cpu", seed=seed).learn(4096)
     assert check_gradient(model).passed
+
+
+def test_a_difference_from_nan_is_not_small():
+    one, nan = th.ones(2), th.tensor([math.nan, 1.0])
+    assert math.isnan(policy_errors.relative_difference(nan, one))
+    assert math.isnan(policy_errors.relative_difference(one, nan))
+    assert policy_errors.relative_difference(th.zeros(2), th.zeros(2)) == 0

@@ -10,6 +10,7 @@ import torch as th
 from environments import Corridor
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_reinforce import REINFORCE
@@ -350,3 +351,24 @@ def test_the_gradient_is_the_updates(rollout):
     callback = PitfallCallback()
     model.learn(1, callback)
     assert float(callback.gradient.norm()) == pytest.approx(model.logger.name_to_value["train/grad_norm"], rel=1e-4)
+
+
+def test_the_randomness_of_an_unknown_distribution_is_not_known(monkeypatch):
+    policy = REINFORCE("MlpPolicy", "Pendulum-v1", device="cpu").policy
+    obs = th.zeros(4, 3)
+    distribution = policy.get_distribution(obs)
+    distribution.distribution = th.distributions.Laplace(th.zeros(4, 1), th.ones(4, 1))
+    monkeypatch.setattr(policy, "get_distribution", lambda obs: distribution)
+    assert math.isnan(randomness(policy, obs, 1.0))
+
+
+def test_an_update_that_failed_does_not_count(monkeypatch):
+    """With a logger that the next call of ``learn`` keeps."""
+    model, callback = REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, device="cpu"), PitfallCallback()
+    model.set_logger(Logger(None, []))
+    monkeypatch.setattr(model, "train", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        model.learn(32, callback)
+    monkeypatch.undo()
+    model.learn(64, callback)
+    assert math.isfinite(callback.path)

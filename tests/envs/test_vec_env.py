@@ -166,8 +166,9 @@ def test_attributes_and_methods_where_the_environment_can():
     assert env.env_is_wrapped(gym.Wrapper) == [False] * N_ENVS and env.has_attr("lengths")
     wrapped = synced(lambda: gym.wrappers.TimeLimit(Corridor(), 9))
     assert wrapped.env_is_wrapped(gym.wrappers.TimeLimit, indices=[0, 2]) == [True, True]
-    with pytest.raises(ValueError, match="indices"):
-        env.set_attr("truncate", True, indices=[0])
+    for indices in ([0], [0] * N_ENVS):
+        with pytest.raises(ValueError, match="indices"):
+            env.set_attr("truncate", True, indices=indices)
     assert native(N_ENVS).get_attr("max_episode_steps") == [500] * N_ENVS
     below = CartPoleVectorEnv(N_ENVS)
     below.metadata = below.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
