@@ -68,7 +68,7 @@ class FiniteDifference(BasePolicyGradient):
 
     The statistics of VecNormalize are frozen during an update, so that candidates are compared on one scale. The
     observations of an update are added to them afterwards. The first update uses the statistics of the first reset.
-    Utilities are sums of unscaled rewards. A wrapper above it gets unscaled rewards too.
+    Utilities are sums of unscaled rewards. A wrapper above VecNormalize gets unscaled rewards too.
 
     :param policy: The policy model to use (LinearPolicy, MlpPolicy, CnnPolicy, MultiInputPolicy, MaskedPolicy, or a
         subclass of ``ActorCriticPolicy``)

@@ -323,8 +323,7 @@ class REINFORCE(BasePolicyGradient, OnPolicyAlgorithm):
         env = cast(VecEnv, self.env)
         check_reinforce(self)
         check_starts(self)
-        if self.policy.training:
-            self.policy.set_training_mode(False)
+        self.policy.set_training_mode(False)
         self._apply_temperature_and_floor()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)

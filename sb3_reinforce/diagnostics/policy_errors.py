@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -28,7 +29,8 @@ N_OBSERVATIONS = 8
 
 def relative_difference(x: th.Tensor, y: th.Tensor) -> float:
     """``‖x − y‖ / max(‖x‖, ‖y‖)``, and 0 where both are zero."""
-    scale = max(float(x.norm()), float(y.norm()))
+    # NaN where one is NaN
+    scale = float(th.maximum(x.norm(), y.norm()))
     return float((x - y).norm()) / scale if scale != 0 else 0.0
 
 
@@ -81,7 +83,7 @@ def score_error(policy: ActorCriticPolicy, obs: PyTorchObs, actions: th.Tensor) 
         error = difference_error(policy, obs, actions)
     if scale > 1:
         with scaled(layers[-1], scale, are_logits):
-            error = max(error, difference_error(policy, obs, actions) / 5)
+            error = float(np.maximum(error, difference_error(policy, obs, actions) / 5))
     return error
 
 

@@ -44,7 +44,7 @@ def check_finite(name: str, values: Any, where: tuple[int | None, ...] = ()) -> 
 
 
 def check_length(n_steps: int, max_episode_steps: float, alternative: str = "") -> None:
-    """Refuse to step an episode that has lasted ``n_steps`` and may not be longer."""
+    """Refuse an episode that has lasted ``n_steps`` and may not be longer."""
     if n_steps == max_episode_steps:
         raise ValueError(
             f"An episode has not ended after max_episode_steps={max_episode_steps} steps: give the environment a time "

@@ -69,7 +69,7 @@ def searched_parameters(policy: ActorCriticPolicy) -> Parameters:
 
 
 def observation_in(space: spaces.Space[Any]) -> Any:
-    """One observation, as near to 0 as its space allows, since a features extractor may be undefined outside it."""
+    """A batch of one observation, as near to 0 as its space allows: a features extractor may fail outside it."""
     if isinstance(space, spaces.Dict):
         return {key: observation_in(part) for key, part in space.spaces.items()}
     zeros: Any = create_empty_array(space)

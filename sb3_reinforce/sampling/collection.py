@@ -34,8 +34,8 @@ class Columns:
     """
     What was collected besides the rows of the buffer; ``dones`` is of shape ``(n_steps, n_envs)``.
 
-    ``quota`` is the number of episodes that count in each environment, ``has_values`` whether the buffer has V(s_t);
-    ``state`` is as in ``Rollout``.
+    ``quota`` is the largest number of episodes that count in each environment, ``has_values`` whether the buffer has
+    V(s_t); ``state`` is as in ``Rollout``.
     """
 
     dones: Bools

@@ -12,10 +12,13 @@ from gradient_checks import ACTION_SPACES, HalfDetached, corridor, with_noise
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
 
 from sb3_reinforce import REINFORCE
 from sb3_reinforce.diagnostics import check_gradient, policy_errors
+from sb3_reinforce.diagnostics.sampling import sample
+from sb3_reinforce.estimation.rollout import used_inputs
 from sb3_reinforce.recurrent import RecurrentREINFORCE
 
 
@@ -243,7 +246,26 @@ def test_a_policy_that_has_learned_to_be_almost_deterministic_passes(seed):
 
 
 def test_a_difference_from_nan_is_not_small():
-    one, nan = th.ones(2), th.tensor([math.nan, 1.0])
-    assert math.isnan(policy_errors.relative_difference(nan, one))
-    assert math.isnan(policy_errors.relative_difference(one, nan))
+    nan = th.tensor([math.nan, 1.0])
+    for other in (th.ones(2), th.zeros(2)):
+        assert math.isnan(policy_errors.relative_difference(nan, other))
+        assert math.isnan(policy_errors.relative_difference(other, nan))
     assert policy_errors.relative_difference(th.zeros(2), th.zeros(2)) == 0
+
+
+class NanForLargeMeans(ActorCriticPolicy):
+    """Its log π is right, and the score of a mean beyond 0.5 is NaN."""
+
+    def _get_action_dist_from_latent(self, latent):
+        distribution = super()._get_action_dist_from_latent(latent)
+        mean = distribution.distribution.mean
+        change = th.where(mean.abs() > 0.5, mean - mean.detach(), th.ones_like(mean))
+        mean = mean + change.square().sqrt() - change.detach().abs()
+        return self.action_dist.proba_distribution(mean, self.log_std)
+
+
+def test_scores_that_are_nan_with_a_larger_last_layer_do_not_pass():
+    model = REINFORCE(NanForLargeMeans, corridor(spaces.Box(-1, 1, (2,), np.float32)), device="cpu", seed=0)
+    rollout = sample(model, 2)
+    error = policy_errors.score_error(model.policy, *used_inputs(rollout))
+    assert math.isnan(error)

@@ -84,13 +84,14 @@ def test_a_run_does_not_depend_on_the_default_dtype(space, dtype):
     assert ends[0] == ends[1]
 
 
-def test_a_policy_that_a_callback_puts_in_training_mode_acts_in_evaluation_mode():
+@pytest.mark.parametrize("part", ("", "action_net"))
+def test_a_policy_that_a_callback_puts_in_training_mode_acts_in_evaluation_mode(part):
     modes = []
     model = REINFORCE("MlpPolicy", Corridor((5,)), n_steps=8, device="cpu")
     model.policy.action_net.register_forward_hook(
         lambda module, *_: modes.append((model.is_collecting, module.training))
     )
-    model.learn(16, Record(lambda model: model.policy.set_training_mode(True), "rollout_start"))
+    model.learn(16, Record(lambda model: model.policy.get_submodule(part).train(), "rollout_start"))
     assert {training for is_collecting, training in modes if is_collecting} == {False}
 
 
