@@ -71,8 +71,10 @@ def curve(runs: pd.DataFrame, column: str, end: float) -> tuple[np.ndarray, np.n
 
 def draw_curves(results: pd.DataFrame, columns: Sequence[str]) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
-    n_rows = math.ceil(len(tasks) * len(columns) / 4)
-    figure, grid = plt.subplots(n_rows, 4, figsize=(12, 2.4 * n_rows), layout="constrained", squeeze=False)
+    n_columns = min(len(tasks) * len(columns), 4)
+    n_rows = math.ceil(len(tasks) * len(columns) / n_columns)
+    size = (3 * n_columns, 2.4 * n_rows)
+    figure, grid = plt.subplots(n_rows, n_columns, figsize=size, layout="constrained", squeeze=False)
     rows = grid.reshape(-1, len(columns))
     for axes, ((task, budget), runs) in zip(rows, tasks, strict=False):
         common = set.intersection(*(set(mine["seed"]) for _, mine in runs.groupby("algorithm")))
