@@ -31,6 +31,7 @@ OPTIONS = {
 OF_ENJOY = ("algo", "env", "log_folder", "gym_packages")
 
 CLASS = re.compile(r"<class ('[\w.]+')>")
+INFINITY = re.compile(r"""('[^']*'|"[^"]*")|\binf\b""")
 
 CARD = """---
 library_name: stable-baselines3
@@ -112,12 +113,17 @@ def zoo_command(name: str, arguments: dict[str, Any]) -> str:
     for option, argument in OPTIONS.items():
         value = arguments.get(argument)
         if isinstance(value, dict):
-            # The Zoo finds a class by its path
-            value = [f"{key}:" + CLASS.sub(r"get_class_by_name(\1)", repr(part)) for key, part in value.items()]
+            value = [f"{key}:{as_python(part)}" for key, part in value.items()]
         words = value if isinstance(value, list) else [str(value)]
         if value not in (None, "", []):
             command += [option, *words]
     return shlex.join(command)
+
+
+def as_python(value: Any) -> str:
+    """A setting as the Zoo can evaluate it: a class by its path, and infinity as a call."""
+    text = CLASS.sub(r"get_class_by_name(\1)", repr(value))
+    return INFINITY.sub(lambda found: found[1] or "float('inf')", text)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import importlib
 import re
 import runpy
 from collections.abc import Iterable, Iterator
+from inspect import signature
 from pathlib import Path
 from typing import Any, get_args
 
@@ -97,11 +98,19 @@ def check_hyperparams(algorithm: str, hyperparams: Settings) -> None:
                 )
             if key in scheduled_keys(algorithm) and not LINEAR.fullmatch(value):
                 raise ConfigurationError(f"{key} must be a number, or lin_NUMBER to fall linearly to 0, got {value!r}")
-    for key, path, _ in classes_of(hyperparams):
+    for key, path, names in classes_of(hyperparams):
         try:
-            utils.get_class_by_name(path)
+            found = utils.get_class_by_name(path)
         except (AttributeError, TypeError, ValueError) as error:
             raise ConfigurationError(f"{key} must be the path of a class, got {path!r}: {error}") from error
+        if key != "policy":
+            positional = () if key == "callback" else ("env",)
+            try:
+                # An unknown name first: it is often a misspelling of the missing one
+                signature(found).bind_partial(*positional, **names)
+                signature(found).bind(*positional, **names)
+            except TypeError as error:
+                raise ConfigurationError(f"The arguments of {path} in {key}: {error}") from error
     for key in ("n_envs", "frame_stack"):
         check_integer(key, hyperparams.get(key, 1), 1)
     check_number("n_timesteps", hyperparams["n_timesteps"], 1)
@@ -120,12 +129,14 @@ def classes_of(hyperparams: Settings) -> Iterator[tuple[str, Any, Settings]]:
     """Each path of a class that the Zoo will import, with its setting before and its keyword arguments after it."""
     for key in CLASS_KEYS:
         given = hyperparams.get(key)
+        if given is None:
+            continue
         for each in given if isinstance(given, list) else [given]:
             path, names = next(iter(each.items())) if isinstance(each, dict) and each else (each, {})
             is_name = key == "policy" and "." not in str(path)
             if names is None:
                 raise ConfigurationError(f"The arguments of {path} in {key} must be a dict, got None")
-            if not (is_name or path is None or isinstance(path, BaseCallback if key == "callback" else type)):
+            if not (is_name or isinstance(path, BaseCallback if key == "callback" else type)):
                 yield key, path, as_dict(f"The arguments of {path} in {key}", names)
 
 

@@ -103,7 +103,11 @@ def test_a_model_continues_on_its_task_with_its_policy(folder, tmp_path, capsys)
 
 def test_the_command_of_a_model_card_trains_the_same_agent(tmp_path):
     folder = ("-f", str(tmp_path))
-    settings = ("learning_rate:0.01", "policy_kwargs:dict(net_arch=[8],activation_fn=nn.ReLU)")
+    settings = (
+        "learning_rate:0.01",
+        "max_grad_norm:float('inf')",
+        "policy_kwargs:dict(net_arch=[8],activation_fn=nn.ReLU)",
+    )
     train("reinforce", "-n", "64", *folder, "-params", *settings, "--env-kwargs", "sutton_barto_reward:True")
     card = write_card(str(tmp_path), "reinforce", "CartPole-v1", n_episodes=2).read_text()
     command = re.search(r"^python -m sb3_reinforce.zoo (train .*)$", card, re.M)[1]
@@ -248,6 +252,9 @@ SETTINGS = [
     ("callback: sb3_reinforce.Nope", "callback must be the path of a class, got 'sb3_reinforce.Nope'"),
     ("env_wrapper: [{gymnasium.wrappers.RescaleAction: {low: 1}}]", "unexpected keyword argument 'low'"),
     ("env_wrapper: [{gymnasium.wrappers.FlattenObservation: }]", "in env_wrapper must be a dict, got None"),
+    ("env_wrapper: [null]", "env_wrapper must be the path of a class, got None"),
+    ("env_wrapper: gymnasium.wrappers.TimeLimit", "TimeLimit in env_wrapper: missing a required argument: 'max_ep"),
+    ("callback: [stable_baselines3.common.callbacks.CheckpointCallback]", "missing a required argument: 'save_freq'"),
     ("env_wrapper: ..x", "env_wrapper must be the path of a class, got '..x'"),
     ("normalize: 1", "normalize must be True, False or a dict, got 1"),
     ("normalize: {norm_ob: true}", "unexpected keyword argument 'norm_ob'"),
