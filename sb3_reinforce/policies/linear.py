@@ -30,8 +30,10 @@ class LinearPolicy(ActorCriticPolicy):
         lr_schedule: Schedule,
         **kwargs: Any,
     ):
-        if kwargs.get("net_arch"):
-            raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={kwargs['net_arch']!r}: use MlpPolicy")
+        net_arch = kwargs.get("net_arch")
+        layers = net_arch.values() if isinstance(net_arch, dict) else [net_arch]
+        if any(layers):
+            raise ValueError(f"LinearPolicy has no hidden layers, got net_arch={net_arch!r}: use MlpPolicy")
         if isinstance(observation_space, spaces.Dict) and "features_extractor_class" not in kwargs:
             raise ValueError(
                 f"LinearPolicy needs observations in one array, got {observation_space}: use MultiInputPolicy, "

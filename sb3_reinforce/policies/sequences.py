@@ -84,7 +84,7 @@ class RecurrentPolicy(ActorCriticPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions and the next state; observation and state are checked first."""
+        """Return the actions and the next state; the arguments are checked first."""
         if isinstance(observation, tuple):
             raise ValueError("observation must not be a tuple: reset returns (observation, info), pass the first only")
         obs, _ = self.obs_to_tensor(observation)
@@ -97,6 +97,10 @@ class RecurrentPolicy(ActorCriticPolicy):
                     f"state must be the one that predict returned for these {n_envs} environments, two arrays of shape "
                     f"{(n_layers, n_envs, n_hidden)}, or None where episodes start; got {shapes}"
                 )
+        if episode_start is not None and np.size(episode_start) != n_envs:
+            raise ValueError(
+                f"episode_start must have {n_envs} entries, one for each observation, got {np.size(episode_start)}"
+            )
         return super().predict(observation, state, episode_start, deterministic)
 
     def zero_state(self, n_envs: int) -> th.Tensor:

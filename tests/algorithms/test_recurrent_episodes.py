@@ -63,6 +63,8 @@ TWO_STATES = (np.zeros((1, 2, 4)), np.zeros((1, 2, 4)))
         (memory(memory=["gru"]), r"memory must be one of 'lstm', 'gru', 'rnn', got \['gru'\]"),
         (memory(memory="gru", lstm_kwargs={"nonlinearity": "relu"}), "lstm_kwargs must be"),
         (predict(THREE, TWO_STATES), r"state must be .* of shape \(1, 3, 4\)"),
+        (predict(THREE, None, [True]), "episode_start must have 3 entries, one for each observation, got 1"),
+        (predict(THREE[0], None, [True, False]), "episode_start must have 1 entries"),
         (predict((THREE, {})), "observation must not be a tuple"),
     ],
 )

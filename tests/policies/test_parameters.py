@@ -103,8 +103,10 @@ def test_an_actor_without_trainable_parameters_is_an_error() -> None:
 
 
 def test_linear_policy_refuses_hidden_layers() -> None:
-    with pytest.raises(ValueError, match=r"net_arch=\[8\]"):
-        make(LinearPolicy, net_arch=[8])
+    for net_arch in ([8], {"pi": [], "vf": [8]}):
+        with pytest.raises(ValueError, match="no hidden layers"):
+            make(LinearPolicy, net_arch=net_arch)
+    assert names(make(LinearPolicy, net_arch={"pi": [], "vf": []})) == {"action_net.weight"}
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
