@@ -155,7 +155,7 @@ def compare_to_reference(
 ) -> tuple[Estimate, Estimate]:
     """Cosine of estimates ``(m, n)`` to other gradients ``(m', n)``, and the signal-to-noise ratio of one estimate."""
     counts = resample_counts(len(gradients), n_resamples, seed)
-    others = resample_counts(len(reference), n_resamples, seed + 1)
+    others = resample_counts(len(reference), n_resamples, seed ^ 1)
     moments = compute_moments(gram(gradients), counts)
     # ⟨E g, E r⟩ of each pair of resamples
     products = (counts @ gram(gradients, reference) * others).sum(1) / (counts.sum(1) * others.sum(1))

@@ -22,7 +22,7 @@ def randomness(policy: ActorCriticPolicy, obs: Any, entropy: float) -> float:
         std = float(distribution.stddev.mean()) if isinstance(distribution, th.distributions.Normal) else math.nan
         # A squashed policy acts on [-1, 1], whatever the space
         half_width = 1.0 if policy.squash_output else float(np.subtract(space.high, space.low, dtype=float).mean() / 2)
-        return float(np.minimum(std / half_width, 1.0))
+        return float(np.minimum(std / half_width, 1.0)) if half_width > 0 else math.nan
     parts = distribution if isinstance(distribution, list) else [distribution]
     if all(isinstance(part, th.distributions.Categorical) for part in parts):
         # Of a policy that prefers none of the actions that a mask allows

@@ -1,5 +1,6 @@
 """Statistics of sampled gradients against Gaussians whose statistics are known, and against enumeration."""
 
+import sys
 from itertools import product
 
 import numpy as np
@@ -102,6 +103,11 @@ def test_where_little_is_seen_of_the_gradient_its_cosine_is_covered_all_the_same
         found = compare_to_reference(gradients, others, 200, 0.95, seed)[0]
         both += found.low <= truth <= found.high
     assert min(covered, both) >= 450, (covered, both)
+
+
+def test_the_largest_seed_is_taken():
+    gradients = draw(8, th.Generator().manual_seed(0))
+    assert compare_to_reference(gradients, gradients + 1, 10, 0.95, sys.maxsize)[0].low <= 1
 
 
 def test_without_a_signal_the_cosine_is_not_known():

@@ -231,6 +231,12 @@ def test_noise_wider_than_the_actions_is_all_the_randomness_there_is(space):
 
 
 @th.no_grad()
+def test_the_randomness_of_a_single_action_is_not_known():
+    policy = REINFORCE("MlpPolicy", Corridor(action_space=spaces.Box(0.5, 0.5, (1,))), device="cpu").policy
+    assert math.isnan(randomness(policy, th.zeros(1, *policy.observation_space.shape), entropy=0.0))
+
+
+@th.no_grad()
 def test_a_squashed_policy_is_as_random_on_a_wide_box_as_on_a_narrow_one():
     """It acts on [-1, 1], and only the environment gets actions of the width of the space."""
     squashed = {"use_sde": True, "policy_kwargs": {"squash_output": True, "log_std_init": -2.0}}
