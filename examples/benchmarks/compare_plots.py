@@ -73,7 +73,8 @@ def draw_curves(results: pd.DataFrame, columns: Sequence[str]) -> None:
     tasks = list(results.groupby(["task", "budget"], sort=False))
     n_columns = min(len(tasks) * len(columns), 4)
     n_rows = math.ceil(len(tasks) * len(columns) / n_columns)
-    size = (3 * n_columns, 2.4 * n_rows)
+    # The legend needs the width of two columns
+    size = (3 * max(n_columns, 2), 2.4 * n_rows)
     figure, grid = plt.subplots(n_rows, n_columns, figsize=size, layout="constrained", squeeze=False)
     rows = grid.reshape(-1, len(columns))
     for axes, ((task, budget), runs) in zip(rows, tasks, strict=False):
