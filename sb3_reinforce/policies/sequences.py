@@ -97,10 +97,9 @@ class RecurrentPolicy(ActorCriticPolicy):
                     f"state must be the one that predict returned for these {n_envs} environments, two arrays of shape "
                     f"{(n_layers, n_envs, n_hidden)}, or None where episodes start; got {shapes}"
                 )
-        if episode_start is not None and np.size(episode_start) != n_envs:
-            raise ValueError(
-                f"episode_start must have {n_envs} entries, one for each observation, got {np.size(episode_start)}"
-            )
+        n_flags = n_envs if episode_start is None else np.asarray(episode_start).size
+        if n_flags != n_envs:
+            raise ValueError(f"episode_start must have {n_envs} entries, one for each observation, got {n_flags}")
         return super().predict(observation, state, episode_start, deterministic)
 
     def zero_state(self, n_envs: int) -> th.Tensor:
