@@ -155,6 +155,7 @@ def compare_to_reference(
 ) -> tuple[Estimate, Estimate]:
     """Cosine of estimates ``(m, n)`` to other gradients ``(m', n)``, and the signal-to-noise ratio of one estimate."""
     counts = resample_counts(len(gradients), n_resamples, seed)
+    # Another seed; the largest has none after it
     others = resample_counts(len(reference), n_resamples, seed ^ 1)
     moments = compute_moments(gram(gradients), counts)
     # ⟨E g, E r⟩ of each pair of resamples
