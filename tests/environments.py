@@ -208,7 +208,15 @@ class NumericEnds(Wrapper):
 
 
 class Reused(Wrapper):
-    """Hands out the same arrays at each step: dones, as numbers, and terminal observations."""
+    """Hands out the same arrays at each step: dones, as numbers, observations and terminal observations."""
+
+    def reset(self):
+        return self.reused(self.venv.reset())
+
+    def reused(self, obs):
+        self.obs = getattr(self, "obs", np.zeros_like(obs))
+        self.obs[:] = obs
+        return self.obs
 
     def step_wait(self):
         obs, rewards, dones, infos = self.venv.step_wait()
@@ -218,7 +226,7 @@ class Reused(Wrapper):
         for i in np.flatnonzero(dones):
             self.last[i] = infos[i]["terminal_observation"]
             infos[i]["terminal_observation"] = self.last[i]
-        return obs, rewards, self.dones, infos
+        return self.reused(obs), rewards, self.dones, infos
 
 
 def of_two(**fault: Any) -> DummyVecEnv:

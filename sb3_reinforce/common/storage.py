@@ -134,6 +134,8 @@ def optimizer_mismatch(optimizer: th.optim.Optimizer, state: Mapping[str, Any]) 
         # A fused step goes through moments and parameter side by side, and would write beyond shorter moments
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         for index, moments in state.get("state", {}).items():
+            if index not in range(len(parameters)):
+                return f"it has moments of a parameter {index}"
             for key, moment in moments.items():
                 shape = tuple(np.shape(moment))
                 needed = tuple(parameters[index].shape)

@@ -4,11 +4,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch as th
 from torch.nn.utils.rnn import pad_sequence
 
 from sb3_reinforce.common.arguments import check_integer, check_number
-from sb3_reinforce.common.tensors import stack, take
+from sb3_reinforce.common.tensors import map_parts
 from sb3_reinforce.diagnostics.sampling import check_model, collect_episodes, env_of, episode_bar, seeded
 from sb3_reinforce.diagnostics.statistics import compute_moments, gram, variance
 from sb3_reinforce.diagnostics.tables import Estimate, as_text, interval, resample_counts
@@ -101,9 +102,10 @@ def sample_starts(model: REINFORCE, n_starts: int, progress_bar: bool = False) -
         # Pending seeds would replace the seeds of the first episodes
         env.reset()
         for part in seeds.reshape(-1, env.num_envs):
-            firsts.append(start_from(collector, part))
+            # A copy: some VecEnvs reuse the array
+            firsts.append(map_parts(np.copy, start_from(collector, part)))
             rollouts.append(collect_episodes(collector, bar))
-        check_groups(stack([take(obs, i) for obs in firsts for i in range(env.num_envs)]), N_PER_START)
+        check_groups(map_parts(lambda *parts: np.concatenate(parts), *firsts), N_PER_START)
     return rollouts
 
 

@@ -77,8 +77,8 @@ class NumpyActor:
         self.action_dist = policy.action_dist
         self.mlp_extractor = policy.mlp_extractor
         self.extractor = [policy.pi_features_extractor, *policy.pi_features_extractor.children()]
-        body = policy.mlp_extractor.policy_net
-        parts = [policy, self.mlp_extractor, body, *self.extractor, *before, *layers]
+        self.body = policy.mlp_extractor.policy_net
+        parts = [policy, self.mlp_extractor, self.body, *self.extractor, *before, *layers]
         hooks = [vars(part)[name] for part in parts for name in HOOKS]
         self.dicts = [vars(self.action_dist), *map(vars, parts), *hooks]
         self.n_entries = sum(map(len, self.dicts))
@@ -109,7 +109,8 @@ class NumpyActor:
             and policy.action_dist is self.action_dist
             and [policy.pi_features_extractor, *policy.pi_features_extractor.children()] == self.extractor
             and policy.mlp_extractor is self.mlp_extractor
-            and [*policy.mlp_extractor.policy_net, policy.action_net] == self.layers
+            and policy.mlp_extractor.policy_net is self.body
+            and [*self.body, policy.action_net] == self.layers
             and addresses_of(policy, self.layers) == self.addresses
         )
 

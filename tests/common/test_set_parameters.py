@@ -49,6 +49,7 @@ WRONG = {
     "no finite optimizer": lambda p: moments_with(p, not_finite),
     "no finite learning rate": lambda p: groups_with(p, lr=float("inf")),
     "another optimizer's groups": lambda p: optimizer_with(p, param_groups=[{"params": [0]}] * 2),
+    "another optimizer's parameter": lambda p: optimizer_with(p, state={99: {"exp_avg": th.zeros(3)}}),
     "another optimizer's moments": lambda p: moments_with(p, lambda moments: {**moments, "exp_avg": th.zeros(3, 77)}),
 }
 

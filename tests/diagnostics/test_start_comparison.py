@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch as th
-from environments import Corridor, Scales, Tree
+from environments import Corridor, Reused, Scales, Tree
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_reinforce import REINFORCE
@@ -44,6 +45,15 @@ def test_starts_are_the_same_whatever_the_number_of_environments(n_envs):
     """Eight episodes of a start follow each other over the environments; 3 of them need a multiple of 3 starts."""
     report = compare_starts(make_model(n_envs, scale=1000.0), n_starts=5 if n_envs == 3 else 6)
     assert report.share.value > 0.999
+
+
+def test_environments_that_reuse_their_arrays_have_the_same_report():
+    reports = []
+    for wrap in (lambda env: env, Reused):
+        env = wrap(make_vec_env("CartPole-v1", 8))
+        model = REINFORCE("MlpPolicy", env, baseline="leave_one_out", seed=0, device="cpu")
+        reports.append(str(compare_starts(model, n_starts=4)))
+    assert reports[0] == reports[1]
 
 
 def test_an_environment_that_ignores_seeds_is_refused():

@@ -234,7 +234,14 @@ def hook_on_the_body(model):
     model.policy.mlp_extractor.policy_net.register_forward_hook(lambda module, x, latent: th.ones_like(latent))
 
 
+def new_body_of_the_same_layers(model):
+    extractor = model.policy.mlp_extractor
+    extractor.policy_net = th.nn.Sequential(*extractor.policy_net)
+    hook_on_the_body(model)
+
+
 HOWS = {
+    "new body": new_body_of_the_same_layers,
     "network": new_network,
     "hook on the body": hook_on_the_body,
     "extractor": new_part_of_the_extractor,
